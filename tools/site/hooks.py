@@ -51,14 +51,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     nav: list[Any] = [{"Home": "README.md"}]
     for title, section in re.findall(r"^## (.+)\n((?:(?!## ).*\n?)*)", index, re.MULTILINE):
         cells = re.findall(r"^\| (.*?) \|", section, re.MULTILINE)
-        links = [link for cell in cells for link in re.findall(r"\[([^]]+)\]\(([^)]+)\)", cell)]
+        links = [link for cell in cells for link in re.findall(r"\[([^]]+)\]\(([^)#]+)\)", cell)]
         # A link that is called like its file has the page's own title in the navigation.
-        pages = [
-            where if text == where else {text: where}
-            for text, to in links
-            if not to.startswith("#")  # a part of the index itself
-            for where in [site_path("docs", to)]
-        ]
+        pages = [where if text == where else {text: where} for text, to in links for where in [site_path("docs", to)]]
         if pages:
             nav.append({title: pages})
     modules = [{name.removeprefix("facediff."): f"api/{name}.md"} for name in config.extra["api"]]
