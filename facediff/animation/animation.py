@@ -28,7 +28,7 @@ from facediff.utils.hints import check_number
 from facediff.utils.lazy import late
 from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, in_range
 
-MAPPED_BYTES = 1 << 26  # How much of a memory map is read before its pages are released
+MAPPED_BYTES = 1 << 23  # How much of a memory map is read before its pages are released
 OUT_OF_RANGE = f"NaN, infinity or a coordinate beyond {COORDINATE:g}"
 
 
@@ -201,14 +201,14 @@ class Animation:
         still = replace(self, vertices=without_head(self.vertices, self.head), head=None)
         return still if self.values is None else still.made_of(self.space, self.values, self.deltas)
 
+    def stretches(self) -> Iterator[tuple[slice, npt.NDArray[np.float32]]]:
+        """Stretches of consecutive frames with their vertices; see :func:`stretches_of`."""
+        return stretches_of(self.vertices)
+
     def frames(self) -> Iterator[npt.NDArray[np.float32]]:
         """Frame after frame (V, 3); the pages of a memory map that have been read are released."""
-        mapped = self.vertices if isinstance(self.vertices, np.memmap) else None
-        step = max(1, MAPPED_BYTES // max(1, self.vertices[0].nbytes))
-        for start in range(0, len(self.vertices), step):
-            yield from self.vertices[start : start + step]
-            if mapped is not None and mapped.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
-                mapped._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+        for _, vertices in self.stretches():
+            yield from vertices
 
     def refuse_not_finite(self) -> None:
         """Check every frame."""
@@ -346,6 +346,22 @@ class Animation:
         facts += [f"style of {metadata['style']}"] if "style" in metadata else []
         facts += ["with speech" if self.speech is not None else "silent"]
         return f'Animation("{self.name}": {", ".join(facts)})'
+
+
+def stretches_of(motion: npt.NDArray[np.float32]) -> Iterator[tuple[slice, npt.NDArray[np.float32]]]:
+    """Stretches of a motion (T, points, dims), and which frames they are; all of it at once where it is in memory.
+
+    The pages of a memory map that have been read are released, so that a file of any size takes little memory.
+    """
+    if not isinstance(motion, np.memmap):
+        yield slice(0, len(motion)), motion
+        return
+    step = max(1, MAPPED_BYTES // max(1, motion[0].nbytes))
+    for start in range(0, len(motion), step):
+        frames = slice(start, min(start + step, len(motion)))
+        yield frames, motion[frames]
+        if motion.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
+            motion._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
 
 def without_head(vertices: npt.NDArray[np.float32], head: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:

@@ -170,7 +170,8 @@ def animate_recording(
         from facediff.export.glb_own_shapes import own_shapes, unused_shapes
 
         mesh = Path(options.target_mesh)
-        tell(*pipeline.target_notes, *surface_notes(mesh, output, animation))
+        notes = [] if pipeline.retarget is None else pipeline.retarget.notes
+        tell(*notes, *surface_notes(mesh, output, animation))
         if options.own_shapes:
             avatar = own_shapes(mesh)
             tell(avatar.summary, *avatar.left_out(animation))

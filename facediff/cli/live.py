@@ -98,7 +98,7 @@ def live_model(options: AnimationOptions) -> LiveModel:
 
     pipeline = open_pipeline(options)
     if pipeline.rest is not None and pipeline.gate == USUAL_GATE:
-        pipeline.rest.gate = read_gate(usual_gate(pipeline.stream_timing[0])) or pipeline.rest.gate
+        pipeline.rest.mouth.gate = read_gate(usual_gate(pipeline.stream_timing[0])) or pipeline.rest.mouth.gate
     pipeline.stream()  # what cannot be streamed is refused before anything is opened
     face, channels = pipeline.facts, pipeline.gives_channels
     return LiveModel(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ from facediff.animation import Animation
 from facediff.editing import procedural
 from facediff.editing.controls import keys_of, refuse_folder
 from facediff.editing.direction import METADATA, Direction, channel_of, curve, direction_of
+from facediff.editing.expressiveness import expressiveness_words, scaled_regions
 from facediff.editing.eyes import GIVE, Array, Eyes, eyes_for
 from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, noted
 from facediff.errors import FaceDiffError, OptionError
@@ -35,27 +36,37 @@ ACTED = ("brows", "lids", *HEAD)
 
 @dataclass(frozen=True, eq=False)
 class Amounts:
-    """How much of everything there is in each frame of a stretch.
+    """How much of everything there is in each frame of a stretch, with all that is random in it.
 
     Attributes:
         expressiveness: factors by region; empty if nothing is scaled.
-        blinks: a minute; None for none. So for gaze and sway, which are in degrees.
-        gaze: degrees.
-        sway: degrees.
         shapes: weights (T,) by ARKit's names.
         brows: millimetres (T,).
-        lids: shares (T,).
-        turns: degrees of pitch, yaw and roll (T, 3).
+        gaze: degrees to the face's left and upwards (T, 2).
+        lids: how far they are shut (T,).
+        turns: rotations of the head (T, 3), axis-angle in radians.
+        shifts: of the head (T, 3), in head heights.
+        notes: entries of the metadata and their words.
     """
 
     expressiveness: Mapping[str, Amount] = field(default_factory=dict)
-    blinks: Amount | None = None
-    gaze: Amount | None = None
-    sway: Amount | None = None
     shapes: Mapping[str, Array] = field(default_factory=dict)
     brows: Array | None = None
+    gaze: Array | None = None
     lids: Array | None = None
     turns: Array | None = None
+    shifts: Array | None = None
+    notes: tuple[tuple[str, str], ...] = ()
+
+    def part(self, frames: slice) -> Amounts:
+        """The amounts of some of the frames; the notes are still those of all of them."""
+
+        def cut(value: Any) -> Any:  # noqa: ANN401 - an array of frames, numbers, or arrays by name
+            if isinstance(value, Mapping):
+                return {name: cut(amount) for name, amount in value.items()}
+            return value[frames] if isinstance(value, np.ndarray) else value
+
+        return Amounts(**{name: cut(value) for name, value in vars(self).items()})
 
 
 class ControlledFace:
@@ -148,16 +159,20 @@ class ControlledFace:
                     f"{self.direction.source}: channel {name}: needs the whole animation; animate a recording"
                 )
 
-    def amounts(self, frames: int, frame_rate: float, *, start: int = 0, acted: Array | None = None) -> Amounts:
+    def amounts(
+        self, frames: int, frame_rate: float, *, seed: int = 0, start: int = 0, acting: Array | None = None
+    ) -> Amounts:
         """How much of everything there is in a stretch of frames.
 
         Args:
             frames: how many.
             frame_rate: of them.
+            seed: of blinks, gaze and sway, unless the controls have their own; these need all frames of an animation.
             start: the first of them.
-            acted: values (frames, 5) of :data:`ACTED` in them, where there is acting.
+            acting: values (frames, 5) of :data:`ACTED` in them, where there is acting.
         """
         controls = self.controls
+        seed = seed if controls.controls_seed is None else controls.controls_seed
         times = (start + np.arange(frames)) / frame_rate
         curves = (
             {}
@@ -168,102 +183,85 @@ class ControlledFace:
                 if channel_of(name).range is not None
             }
         )
+        notes: list[tuple[str, str]] = []
         factors: dict[str, Amount] = dict(self.factors)
         factors |= {name.partition(".")[2] or "all": curves[name] for name in self._keys("expressiveness")}
-
-        def of_option(name: str, number: float | None) -> Amount | None:
-            return curves.get(name, number)
-
+        if factors:
+            notes.append((EDITED, expressiveness_words(factors)))
+        shapes = {name.partition(".")[2]: curves[name] for name in self._keys("shape")}
+        if shapes:
+            notes.append((EDITED, "shape keys"))
         poses: dict[str, Array] = {name: curves[name] for name in ACTED if name in curves}
-        if acted is not None:
+        if acting is not None:
             strength = curves.get("acting", np.ones(frames))
-            for name, values in zip(ACTED, acted.T, strict=True):
+            for name, values in zip(ACTED, acting.T, strict=True):
                 # A blink is whole or not at all: its strength is how often it happens.
                 values = values * (strength > 0 if name == "lids" else strength)
                 limits = channel_of(name).range
                 assert limits is not None  # noqa: S101 - for the type checker
                 # Keys and acting add up, within what the channel allows for keys alone.
                 poses[name] = np.clip(poses[name] + values if name in poses else values, limits.least, limits.most)
-        turned = any(name in poses for name in HEAD)
-        return Amounts(
-            factors,
-            of_option("blinks", controls.blinks),
-            of_option("gaze", controls.gaze),
-            of_option("sway", controls.sway),
-            {name.partition(".")[2]: curves[name] for name in self._keys("shape")},
-            poses.get("brows"),
-            poses.get("lids"),
-            np.stack([poses.get(name, np.zeros(frames)) for name in HEAD], axis=1) if turned else None,
-        )
+        gaze, degrees = None, curves.get("gaze", controls.gaze)
+        if degrees is not None and self.eyes is not None:
+            gaze = procedural.gaze_over_time(frames, frame_rate, degrees, seed)
+            notes.append((PROCEDURAL, procedural.gaze_words(degrees, seed)))
+        lids, rate = poses.get("lids"), curves.get("blinks", controls.blinks)
+        if rate is not None and self.eyes is not None and self.eyes.closing is not None:
+            blinks = procedural.blinks_over_time(frames, frame_rate, rate, seed)
+            lids = blinks if lids is None else np.maximum(lids, blinks)
+            notes.append((PROCEDURAL, procedural.blink_words(rate, seed)))
+        turns, shifts, sway = None, np.zeros((frames, 3)), curves.get("sway", controls.sway)
+        if any(name in poses for name in HEAD):
+            turns = np.deg2rad(np.stack([poses.get(name, np.zeros(frames)) for name in HEAD], axis=1))
+        if sway is not None:
+            swaying, shifts = procedural.sway_over_time(frames, frame_rate, sway, seed)
+            turns = swaying if turns is None else turns + swaying
+            notes.append((PROCEDURAL, procedural.sway_words(sway, seed)))
+        if self._keys("head"):
+            notes.append((EDITED, "head keys"))
+        if acting is not None:
+            notes.append((PROCEDURAL, f"brow and head acting ({controls.acting}, seed {seed})"))
+        return Amounts(factors, shapes, poses.get("brows"), gaze, lids, turns, shifts, tuple(notes))
 
-    def apply(self, animation: Animation, *, seed: int = 0, start: int = 0, acted: Array | None = None) -> Animation:
-        """The animation, or a stretch of one that begins at a frame, with everything changed that is asked for.
+    def apply(self, animation: Animation, amounts: Amounts) -> Animation:
+        """An animation, or a stretch of one, with everything changed that is asked for.
 
         Expressiveness comes first, then shapes, brows, gaze and lids, and last the head, which takes everything along.
 
         Args:
             animation: of the face, with frames as the model made them.
-            seed: of blinks, gaze and sway, unless the controls have their own.
-            start: the number of its first frame; blinks, gaze and sway need all frames.
-            acted: values (T, 5) of :data:`ACTED`, where there is acting.
+            amounts: of these frames.
         """
         if procedural.moves_head(animation):
             raise FaceDiffError(
                 f"{animation.name}: its head moves already; apply the controls to the animation as it was before"
             )
-        seed = seed if self.controls.controls_seed is None else self.controls.controls_seed
-        frames, rate, eyes = len(animation.vertices), animation.frame_rate, self.eyes
-        amounts = self.amounts(frames, rate, start=start, acted=acted)
+        eyes = self.eyes
+
+        def with_vertices(vertices: npt.NDArray[np.float32]) -> Animation:
+            return replace(animation, vertices=vertices)
+
         # Expressiveness must not scale procedural motion, a blink must be able to shut eyes that gaze has opened, and
         # all of them need the head in the pose of the neutral face, which it leaves last.
         if amounts.expressiveness:
-            from facediff.editing.expressiveness import scale_regions
-
-            animation = scale_regions(animation, amounts.expressiveness, eyes)
+            animation = with_vertices(scaled_regions(animation, amounts.expressiveness, eyes))
         if amounts.shapes:
             from facediff.editing.face_shapes import add_shapes
 
-            moved = add_shapes(procedural.copied(animation.vertices), self.shapes, amounts.shapes)
-            animation = noted(animation, moved, EDITED, "shape keys")
+            animation = with_vertices(add_shapes(procedural.copied(animation.vertices), self.shapes, amounts.shapes))
         if self.brows is not None and amounts.brows is not None:
             from facediff.editing.brows import raise_brows
 
-            animation = replace(animation, vertices=raise_brows(animation, self.brows, amounts.brows))
+            animation = with_vertices(raise_brows(animation, self.brows, amounts.brows))
         if amounts.gaze is not None and eyes is not None:
-            animation = procedural.add_gaze(animation, eyes, degrees=amounts.gaze, seed=seed)
-        animation = self._with_lids(animation, amounts, seed)
-        animation = self._with_head(animation, amounts, seed)
-        if acted is not None:
-            note = f"brow and head acting ({self.controls.acting}, seed {seed})"
-            animation = noted(animation, animation.vertices, PROCEDURAL, note)
+            animation = with_vertices(procedural.turn_eyes(animation, eyes, amounts.gaze))
+        if amounts.lids is not None and eyes is not None and eyes.closing is not None:
+            animation = with_vertices(procedural.shut_lids(animation, eyes, amounts.lids))
+        if amounts.turns is not None and amounts.shifts is not None:
+            animation = procedural.move_head(animation, amounts.turns, amounts.shifts)
+        for key, note in amounts.notes:
+            animation = noted(animation, animation.vertices, key, note)
         return self._with_direction(animation)
-
-    def _with_lids(self, animation: Animation, amounts: Amounts, seed: int) -> Animation:
-        if self.eyes is None or self.eyes.closing is None or (amounts.blinks is None and amounts.lids is None):
-            return animation
-        if amounts.lids is None and amounts.blinks is not None:
-            return procedural.add_blinks(animation, self.eyes, rate=amounts.blinks, seed=seed)
-        shut = np.zeros(len(animation.vertices)) if amounts.lids is None else amounts.lids
-        if amounts.blinks is not None:
-            frames, rate = len(animation.vertices), animation.frame_rate
-            shut = np.maximum(shut, procedural.blinks_over_time(frames, rate, amounts.blinks, seed))
-            animation = noted(animation, animation.vertices, PROCEDURAL, procedural.blink_words(amounts.blinks, seed))
-        return replace(animation, vertices=procedural.shut_lids(animation, self.eyes, shut))
-
-    def _with_head(self, animation: Animation, amounts: Amounts, seed: int) -> Animation:
-        if amounts.turns is None:
-            if amounts.sway is None:
-                return animation
-            return procedural.add_sway(animation, degrees=amounts.sway, seed=seed)
-        frames = len(animation.vertices)
-        turns, shifts = np.deg2rad(amounts.turns), np.zeros((frames, 3))
-        if amounts.sway is not None:
-            swaying, shifts = procedural.sway_over_time(frames, animation.frame_rate, amounts.sway, seed)
-            turns = turns + swaying
-            animation = noted(animation, animation.vertices, PROCEDURAL, procedural.sway_words(amounts.sway, seed))
-        if self._keys("head"):
-            animation = noted(animation, animation.vertices, EDITED, "head keys")
-        return procedural.move_head(animation, turns, shifts)
 
     def _with_direction(self, animation: Animation) -> Animation:
         """The direction in the metadata, next to what the animation was made with; that a model follows is there."""
@@ -310,11 +308,11 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
                     f"{direction.source}: instead_of: the keys do what --{option} did, and {animation.name} has that "
                     f"already; give the animation as it was before"
                 )
-    acted = None
+    gestures = None
     if controls.acting is not None:
         from facediff.editing.acting import act, read_acting
 
-        acted = act(
+        gestures = act(
             read_acting(controls.acting), animation, seed if controls.controls_seed is None else controls.controls_seed
         )
     face = ControlledFace(
@@ -326,4 +324,5 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
         animation.unit,
         animation.name,
     )
-    return face.apply(animation, seed=seed, acted=acted)
+    amounts = face.amounts(len(animation.vertices), animation.frame_rate, seed=seed, acting=gestures)
+    return face.apply(animation, amounts)

@@ -65,7 +65,19 @@ def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], n
 def scale_regions(
     animation: Animation, factors: Mapping[str, float | npt.NDArray[np.floating]], eyes: Eyes | None = None
 ) -> Animation:
-    """Scale how far every vertex goes from the neutral face; the head must not sway yet.
+    """Scale how far every vertex goes from the neutral face; the arguments are those of :func:`scaled_regions`."""
+    return noted(animation, scaled_regions(animation, factors, eyes), EDITED, expressiveness_words(factors))
+
+
+def expressiveness_words(factors: Mapping[str, float | npt.NDArray[np.floating]]) -> str:
+    """Expressiveness in the metadata."""
+    return f"expressiveness ({', '.join(f'{name} {in_words(value)}' for name, value in factors.items())})"
+
+
+def scaled_regions(
+    animation: Animation, factors: Mapping[str, float | npt.NDArray[np.floating]], eyes: Eyes | None = None
+) -> npt.NDArray[np.float32]:
+    """Vertices (T, V, 3) that go further from the neutral face, or less far; the head must not sway yet.
 
     Args:
         animation: with the regions that are named.
@@ -95,8 +107,7 @@ def scale_regions(
             share = np.clip((offsets[lids] * closing).sum(-1) / (closing**2).sum(-1), 0.0, 1.0)
             scaled[lids] += ((1.0 - factor[lids]) * share)[:, None] * closing
         vertices[index] = animation.template + scaled
-    scales = ", ".join(f"{name} {in_words(value)}" for name, value in factors.items())
-    return noted(animation, vertices, EDITED, f"expressiveness ({scales})")
+    return vertices
 
 
 @dataclass(frozen=True, eq=False)

@@ -165,8 +165,23 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: Amount = DEGREES_GAZE
     """
     if not eyes.eyeballs:
         raise FaceDiffError(f"{eyes.source}: does not say which vertices are the eyeballs; {GIVE}")
+    angles = gaze_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
+    return noted(animation, turn_eyes(animation, eyes, angles), PROCEDURAL, gaze_words(degrees, seed))
+
+
+def gaze_words(degrees: Amount, seed: int) -> str:
+    """Gaze in the metadata."""
+    return f"gaze ({in_words(degrees)} degrees, seed {seed})"
+
+
+def gaze_over_time(frames: int, frame_rate: float, degrees: Amount, seed: int) -> Array:
+    """Where the eyes look in every frame (T, 2) at a largest angle that may change from frame to frame."""
     most, share = largest_of(degrees)
-    angles = share * gaze_curve(len(animation.vertices), animation.frame_rate, degrees=most, seed=seed)
+    return np.asarray(share * gaze_curve(frames, frame_rate, degrees=most, seed=seed))
+
+
+def turn_eyes(animation: Animation, eyes: Eyes, angles: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    """Vertices (T, V, 3) with eyeballs that are turned by angles (T, 2), and lids that follow them."""
     turns = gaze_rotations(angles)
     vertices = copied(animation.vertices)
     for ball in eyes.eyeballs:
@@ -183,7 +198,7 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: Amount = DEGREES_GAZE
         follow = (-LIDS_PER_DEGREE * angles[:, 1]).astype(np.float32)
         for index in np.flatnonzero(follow):
             vertices[index, lids] += follow[index] * closing
-    return noted(animation, vertices, PROCEDURAL, f"gaze ({in_words(degrees)} degrees, seed {seed})")
+    return vertices
 
 
 @ranges.checked

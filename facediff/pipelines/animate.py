@@ -17,31 +17,40 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from facediff.animation import Animation
 from facediff.animation.options import AnimationOptions, DirectionLike, ExportOptions, Scales, scales_text
 from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
 from facediff.errors import OptionError
+from facediff.pipelines.stages import (
+    Act,
+    AnimationStream,
+    Array,
+    CloseLips,
+    Decode,
+    Denoise,
+    Direct,
+    Generate,
+    Rest,
+    Retarget,
+    Sample,
+    Stage,
+    Take,
+    VertexGenerator,
+)
+from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, MouthAtRest, read_gate
 from facediff.utils import SAMPLE_RATE, hints, ranges
 from facediff.utils.files import holds_glb, scratch_folder, valid_text
 from facediff.utils.hub import is_audio2face
 from facediff.utils.progress import track
+from facediff.version import __version__
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from facediff.animation import Animation
-    from facediff.editing.acting import Acting
-    from facediff.editing.controlled import ControlledFace
-    from facediff.editing.correspondence import Correspondence
     from facediff.editing.direction import Direction
     from facediff.spaces.decoding import ChannelDecoder
     from facediff.speech.audio import SpeechRecording
-    from facediff.speech.phonemes import TimedPhoneme
-    from facediff.speech.stream import AnimationStream, VertexGenerator
-    from facediff.speech.voice_activity import MouthAtRest
     from facediff.speech.windows import WindowPlan
-
-    Array = npt.NDArray[np.float32]
 
 PIXEL_SECONDS = 4e-8  # What drawing and encoding a pixel of a video takes
 
@@ -60,8 +69,6 @@ def check_directed(options: AnimationOptions) -> None:
 
 def check_options(options: AnimationOptions) -> None:
     """Refuse options that contradict each other and files that are not there, before a model is loaded."""
-    from facediff.speech.voice_activity import OFF, read_gate
-
     expressivity_of(options)
     read_scales(options.guidance)
     read_gate(options.voice_gate or OFF)
@@ -115,12 +122,12 @@ class AnimationPipeline(ABC):
         seed: of the first sample.
         gate: the voice gate's name with its options.
         progress: called while motion is generated; None for a bar on the terminal, if the options ask for one.
-
-        target_notes: what a user should know of the motion on the target mesh, where it was carried to it anew.
+        channels: the stage that finds channels of finished vertices, of a model that has such.
     """
 
     style_name = ""
     """Name of the style of what was generated last."""
+    channels: Stage | None = None
     step_seconds = 0.01
     """What generating a second of speech takes on two processor cores."""
 
@@ -136,10 +143,6 @@ class AnimationPipeline(ABC):
         rest_weights: Callable[[], Array],
         decoder: ChannelDecoder | None = None,
     ) -> None:
-        import numpy as np
-
-        from facediff.speech.voice_activity import QUICK_GATE, USUAL_GATE, MouthAtRest, read_gate
-
         self.options, self.facts, self.windows = options, face, windows
         self.frame_rate: float = face["frame_rate"]
         self.windows.in_frames(self.frame_rate)
@@ -151,33 +154,53 @@ class AnimationPipeline(ABC):
             raise OptionError("seed", one_animation, options.seed)
         self.seed = options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or drawn else 0
         self.progress: Progress | None = None
-        self.rest: MouthAtRest | None = None
         self.decoder = decoder
-        self.resting: Array = face["template"] if decoder is None else decoder.resting[:, None].astype(np.float32)
         self.gate = options.voice_gate or usual_gate
         if options.low_latency and self.gate == USUAL_GATE:
             self.gate = QUICK_GATE  # The usual gate looks further ahead than windows of low latency do.
+        self.rest: Rest | None = None
         if (gate := read_gate(self.gate)) is not None:
+            resting = face["template"] if decoder is None else decoder.resting[:, None].astype(np.float32)
             weights = rest_weights() if decoder is None else decoder.rest_weights
-            self.rest = MouthAtRest(gate, self.resting, weights, self.frame_rate)
-        self.acting: Acting | None = None
+            self.rest = Rest(MouthAtRest(gate, resting, weights, self.frame_rate))
+        self.act: Act | None = None
         if options.acting is not None:
             from facediff.editing.acting import read_acting
 
-            self.acting = read_acting(options.acting)
-        self._correspondence: Correspondence | None = None
-        self.target_notes: list[str] = []
-        self._phonemes: list[TimedPhoneme] | None = None  # of the recording, once they are known
-        self.face: ControlledFace | None = None
+            self.act = Act(read_acting(options.acting), self.frame_rate, options.controls_seed)
+        self.lips: CloseLips | None = None
+        if options.alignment is not None or options.transcript is not None:
+            self.lips = CloseLips(options.alignment, options.transcript, options.closure_budget)
+        self.retarget: Retarget | None = None
+        if options.target_mesh is not None:
+            file = None if options.correspondence is None else Path(options.correspondence)
+            self.retarget = Retarget(Path(options.target_mesh), file, own_shapes=options.own_shapes)
         self.direct(keys_of(options.direction, self.frame_rate))
 
-    @abstractmethod
-    def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
-        """Absolute points of some speech (S,), part by part: those of each sample, (T, V, dims)."""
+    @property
+    def stages(self) -> list[Stage]:
+        """What a recording goes through, in this order."""
+        options = self.options
+        stages: list[Stage | None] = [
+            Denoise(noise=options.denoise, semitones=options.voice_shift),
+            Generate(self),
+            self.rest,
+            self.act,
+            Decode(self.still, self.decoder),
+            self.channels,
+            self.lips,
+            None if self.face is None and self.decoder is None else Direct(self.face, self.frame_rate),
+            self.retarget,
+        ]
+        return [stage for stage in stages if stage is not None]
 
     @abstractmethod
-    def generator(self) -> VertexGenerator:
-        """What generates vertices while speech arrives, at its beginning."""
+    def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
+        """Frames for some speech (S,), and their absolute points part by part: those of each sample, (T, V, dims)."""
+
+    @abstractmethod
+    def generator(self, seed: int) -> VertexGenerator:
+        """The model at the beginning of a stream."""
 
     @abstractmethod
     def frames_of(self, samples: int) -> int:
@@ -207,28 +230,6 @@ class AnimationPipeline(ABC):
 
         faces = self.facts.get("faces")
         return self.options.target_mesh is None and is_built_in_face(len(self.facts["template"]), faces)
-
-    def made_of(self, animation: Animation, points: Array) -> Animation:
-        """An animation of the face alone with the channels that its vertices were decoded from; of vertices none."""
-        decoder = self.decoder
-        if decoder is None:
-            return animation
-        return animation.made_of(decoder.space, decoder.values(points), decoder.deltas)
-
-    def posed(self, animation: Animation, points: Array) -> Animation:
-        """A finished animation with the turns of the head that its channels say, unless something else moves it."""
-        from facediff.editing.procedural import move_head, moves_head
-
-        turns = None if self.decoder is None else self.decoder.head_turns(points)
-        if turns is None or moves_head(animation):
-            return animation
-        values = animation.values
-        turned = move_head(animation, turns, 0 * turns)
-        return turned if values is None else turned.made_of(animation.space, values, animation.deltas)
-
-    def shown(self, points: Array) -> Array:
-        """Absolute vertices (T, V, 3) of points as the model generates them."""
-        return points if self.decoder is None else self.decoder.vertices(points)
 
     @property
     @abstractmethod
@@ -288,17 +289,9 @@ class AnimationPipeline(ABC):
         if own_shapes and not is_dressed:
             raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
         with self.animations(recording, output, seed=seed) as animations:
-            written = write_animations(
-                output, animations, export, into=into, own_shapes=own_shapes, z_up=self._target_has_z_up()
-            )
+            z_up = self.retarget is not None and self.retarget.z_up
+            written = write_animations(output, animations, export, into=into, own_shapes=own_shapes, z_up=z_up)
             return written, animations[0]
-
-    def _target_has_z_up(self) -> bool:
-        if self._correspondence is None:
-            return False
-        from facediff.editing.retargeting import has_z_up
-
-        return has_z_up(self._correspondence)
 
     @cached_property
     def _target_wears_more(self) -> bool:
@@ -317,21 +310,23 @@ class AnimationPipeline(ABC):
         kept in memory if it is None.
         """
         first = self.seed if seed is None else seed
-        seeds, name = [first + i for i in range(self.options.samples)], valid_text(recording.name)
-        speech = recording.speech
+        count, name = self.options.samples, valid_text(recording.name)
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
         # by windows here and in one pass there.
-        short = self.windows.in_one_pass(self.frames_of(len(speech)), self.frame_rate)
+        short = self.windows.in_one_pass(self.frames_of(len(recording.speech)), self.frame_rate)
         spool: AbstractContextManager[Path | None] = (
             nullcontext() if short or output is None else scratch_folder(output)
         )
         with spool as folder:
-            finished = []
-            for i, points in enumerate(self._motions(speech, seeds, folder)):
-                title = name if len(seeds) == 1 else f"{name}, sample {i + 1}"
-                animation = self.made_of(self._animation(self.shown(points), recording, title, seeds[i]), points)
-                finished.append(self._finished(animation, seeds[i], points))
-            yield finished
+            samples = [
+                Sample(first + i, name if count == 1 else f"{name}, sample {i + 1}", folder) for i in range(count)
+            ]
+            take = Take(recording, recording.speech, samples)
+            for stage in self.stages:
+                stage.whole(take)
+            yield [
+                replace(sample.animation(), speech=recording.sound, sample_rate=recording.rate) for sample in samples
+            ]
 
     def stream(self, rate: int = SAMPLE_RATE, *, channels: bool = False) -> AnimationStream:
         """What animates speech of any length while it arrives.
@@ -340,33 +335,10 @@ class AnimationPipeline(ABC):
             rate: sample rate of the speech.
             channels: give the channels (m, C, 1) of the model's motion instead of vertices; see :attr:`gives_channels`.
         """
-        from facediff.speech.stream import AnimationStream
-
-        face = self.face
-        if face is not None:
-            face.refuse_whole_animation()
-
-        def finish(
-            points: Array, start: int, acted: npt.NDArray[np.float64] | None
-        ) -> tuple[Array, npt.NDArray[np.float64] | None]:
-            vertices = self.shown(points)
-            if not len(vertices):
-                return vertices, None
-            animation = self.bare(vertices)
-            if face is not None:
-                animation = face.apply(animation, seed=self.seed, start=start, acted=acted)
-            animation = self.posed(animation, points)
-            return animation.vertices, animation.head
-
-        return AnimationStream(
-            self.generator(),
-            rest=self.rest,
-            performer=None
-            if self.acting is None
-            else self.acting.performer(self.frame_rate, self._acting_seed(self.seed)),
-            finish=None if channels or (face is None and self.decoder is None) else finish,
-            rate=rate,
-        )
+        plain = channels or (self.face is None and self.decoder is None)
+        stages = [stage for stage in self.stages if not (plain and isinstance(stage, Decode | Direct))]
+        steps = [stage.stream(self.seed) for stage in stages]
+        return AnimationStream(self.generator(self.seed), [step for step in steps if step is not None], rate)
 
     @property
     def gives_channels(self) -> bool:
@@ -376,17 +348,7 @@ class AnimationPipeline(ABC):
     @property
     def look_ahead(self) -> float:
         """Seconds of speech, at most, that must arrive after an instant before its frame of a stream is certain."""
-        return max(
-            self.stream_timing[0],
-            0.0 if self.acting is None else self.acting.look_ahead,
-            0.0 if self.rest is None else self.rest.openness().look_ahead,
-        )
-
-    def bare(self, vertices: Array) -> Animation:
-        """Frames (m, V, 3) of the animated face, with nothing else that is known of them."""
-        from facediff.animation import Animation
-
-        return Animation(name="stream", vertices=vertices, **self.facts)
+        return max(self.stream_timing[0], *(stage.look_ahead for stage in self.stages))
 
     def track(self, items: Iterable[int], description: str) -> Iterable[int]:
         """Items one by one, whose progress is shown or reported."""
@@ -399,55 +361,13 @@ class AnimationPipeline(ABC):
             yield item
             report(done, max(done, total))
 
-    def _motions(self, speech: Array, seeds: Sequence[int], folder: Path | None) -> Sequence[Array]:
-        """Points (T, V, dims) of the samples, with the mouth at rest in pauses; memory maps if there is a folder."""
-        import numpy as np
-
-        model_speech = speech
-        if self.options.denoise:
-            from facediff.speech.denoising import denoised
-
-            model_speech = denoised(speech)
-        if self.options.voice_shift:
-            from facediff.speech.pitch import shifted_by_pieces
-
-            model_speech = shifted_by_pieces(model_speech, 2 ** (self.options.voice_shift / 12))
-        openness = None
-        writers = []
-        if folder is not None:
-            from facediff.animation.files import MotionWriter
-
-            shape = tuple(self.resting.shape)
-            writers = [MotionWriter(folder / f"{seed}.npy", shape) for seed in seeds]
-        parts: list[list[Array]] = [[] for _ in seeds]
-        done = 0
-        for motions in self.generate(model_speech, seeds):
-            count = len(motions[0])
-            if self.rest is not None and openness is None:
-                # In one pass, a model that counts its frames by itself may give more.
-                openness = self.rest.openness_of(model_speech, max(count, self.frames_of(len(model_speech))))
-            for i, motion in enumerate(motions):
-                if self.rest is not None and openness is not None:
-                    motion = self.rest.apply(motion, openness[done : done + count])
-                if writers:
-                    writers[i].write(motion)
-                else:
-                    parts[i].append(motion)
-            done += count
-        if not writers:
-            return [motion[0] if len(motion) == 1 else np.concatenate(motion) for motion in parts]
-        from facediff.utils.arrays import open_array
-
-        for writer in writers:
-            writer.close()
-        return [open_array(writer.path) for writer in writers]
-
-    def _animation(self, vertices: Array, recording: SpeechRecording, name: str, seed: int) -> Animation:
-        from facediff.animation import Animation
-        from facediff.version import __version__
-
+    def still(self, sample: Sample | None) -> Animation:
+        """The face at rest, one frame: of a sample, with everything that its animation says; or of a stream."""
+        template = self.facts["template"]
+        if sample is None:
+            return Animation(name="stream", vertices=template[None], **self.facts)
         options = self.options
-        metadata = {"generator": f"facediff {__version__}", **self.metadata(seed)}
+        metadata = {"generator": f"facediff {__version__}", **self.metadata(sample.seed)}
         if self.rest is not None:
             metadata["voice gate"] = self.gate
         if options.denoise:
@@ -461,68 +381,7 @@ class AnimationPipeline(ABC):
         for option in ("expressivity", "guidance"):
             if (scales := getattr(options, option)) is not None:
                 metadata[option] = scales_text(scales)
-        sound, rate = recording.sound, recording.rate
-        return Animation(name, vertices, speech=sound, sample_rate=rate, metadata=metadata, **self.facts)
-
-    def _finished(self, animation: Animation, seed: int, points: Array) -> Animation:
-        """A sample after everything that the options ask for after inference."""
-        animation = self._closed(animation)
-        if self.face is not None:
-            acted = None
-            if self.acting is not None:
-                from facediff.editing.acting import act
-
-                acted = act(self.acting, animation, self._acting_seed(seed))
-            animation = self.face.apply(animation, seed=seed, acted=acted)
-        animation = self.posed(animation, points)
-        from facediff.editing.blendshapes import has_arkit_weights
-
-        if self.options.target_mesh is None or (self.options.own_shapes and has_arkit_weights(animation)):
-            return animation
-        from facediff.editing.fit_check import FitReport, refuse_poor
-        from facediff.editing.retargeting import carry, retarget, upright
-        from facediff.mesh import read_mesh
-
-        target = Path(self.options.target_mesh)
-        file = None if self.options.correspondence is None else Path(self.options.correspondence)
-        if self._correspondence is not None:
-            carried = carry(animation, self._correspondence, read_mesh(target), self.options.own_shapes)
-            return upright(carried, self._correspondence)
-
-        def judge(retargeted: Animation, fit: Correspondence, report: FitReport) -> None:
-            refuse_poor(target, report)
-            self.target_notes = [report.summary, *(f"note: {remark}" for remark in report.remarks)]
-
-        # All samples have one face, so that one correspondence serves all.
-        is_known = file is not None and file.exists()
-        retargeted, self._correspondence = retarget(
-            animation, target, file, judge=None if is_known else judge, whole_head=self.options.own_shapes
-        )
-        return retargeted
-
-    def _acting_seed(self, seed: int) -> int:
-        return seed if self.options.controls_seed is None else self.options.controls_seed
-
-    def _closed(self, animation: Animation) -> Animation:
-        """A sample whose lips touch where its phonemes say so, if their times are given."""
-        alignment, transcript = self.options.alignment, self.options.transcript
-        from facediff.animation.animation import PHONEMES
-        from facediff.editing.closures import BUDGET, close_lips
-        from facediff.editing.hearing import heard
-        from facediff.speech.phonemes import closed_times, phonemes_text, read_alignment
-
-        if self._phonemes is None:
-            if alignment is not None:
-                self._phonemes = read_alignment(Path(alignment))
-            elif transcript is not None and (speech := heard(animation)) is not None:
-                from facediff.editing.transcripts import align_transcript
-
-                self._phonemes = align_transcript(transcript, speech)
-            else:
-                return animation
-        budget = self.options.closure_budget
-        closed = close_lips(animation, closed_times(self._phonemes), BUDGET if budget is None else budget)
-        return replace(closed, metadata={**closed.metadata, PHONEMES: phonemes_text(self._phonemes)})
+        return Animation(sample.name, template[None], metadata=metadata, **self.facts)
 
 
 def read_scales(guidance: Scales | None) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,6 +15,7 @@ from facediff.editing.regularised_weights import Regularisation, RegularisedSolv
 from facediff.errors import FaceDiffError, OptionError
 from facediff.pipelines.animate import AnimationPipeline
 from facediff.pipelines.exported import FIXED
+from facediff.pipelines.stages import Stage, Take
 from facediff.runtime.audio2face import LICENCE, Array, Audio2Face, FaceAnimator
 from facediff.runtime.audio2face_folder import Poses
 from facediff.spaces import Rotation, Space
@@ -160,6 +161,7 @@ class Audio2FacePipeline(AnimationPipeline):
             usual_gate=OFF,
             rest_weights=lambda: FaceAnimator(folder, frame_rate).lower[:, 0].astype(np.float32),
         )
+        self.channels = SolveChannels(self.with_channels) if self.has_weights else None
 
     @property
     def stream_timing(self) -> tuple[float, float]:
@@ -182,30 +184,37 @@ class Audio2FacePipeline(AnimationPipeline):
         """How many frames there are for so many samples of speech."""
         return self.model.frames(samples, self.frame_rate)
 
-    def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
-        """Absolute vertices of the skin, a second after the other."""
-        animator, total = FaceAnimator(self.model.folder, self.frame_rate), self.frames_of(len(speech))
+    def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
+        """Frames, and absolute vertices of the skin, a second after the other."""
+        total = self.frames_of(len(speech))
         if not total:
             raise FaceDiffError("the speech holds no samples; give more of it")
-        self._animated, part = [], max(1, round(self.frame_rate))
+        return total, self._seconds(speech, total)
+
+    def _seconds(self, speech: Array, total: int) -> Iterator[Sequence[Array]]:
+        animator, facts = FaceAnimator(self.model.folder, self.frame_rate), self.model.folder.facts
+        part = max(1, round(self.frame_rate))
+        self._animated = []
         for start in self.track(range(0, total, part), "seconds"):
             count = min(part, total - start)
-            result = self.model.infer(speech, self.frame_rate, self.emotion, start=start, frames=count)
+            first = max(0, self.model.moment(start, self.frame_rate) - facts.before)
+            last = self.model.moment(start + count, self.frame_rate) + facts.buffer
+            result = self.model.infer(
+                speech[first:last], self.frame_rate, self.emotion, start=start, frames=count, origin=first
+            )
             animated = animator.animate(result)
             yield [animated.pop("skin_vertices")]
             self._animated.append(animated)
 
-    def generator(self) -> Audio2FaceStream:
-        """What generates vertices while speech arrives."""
+    def generator(self, seed: int) -> Audio2FaceStream:
+        """The model at the beginning of a stream."""
         return Audio2FaceStream(self.model, self.frame_rate, self.emotion)
 
-    def made_of(self, animation: Animation, points: Array) -> Animation:
+    def with_channels(self, animation: Animation) -> Animation:
         """With the weights of the face and the tongue, and how jaw and eyes turn."""
-        if not self.has_weights:
-            return animation
         animated = {name: np.concatenate([part[name] for part in self._animated]) for name in self._animated[0]}
         poses = self.model.folder.poses
-        columns = {"skin": self.weights.solve(self.model, "skin", points)}
+        columns = {"skin": self.weights.solve(self.model, "skin", animation.vertices)}
         if "tongue" in poses:
             columns["tongue"] = self.weights.solve(self.model, "tongue", animated["tongue_vertices"])
         turned = convert(animated["jaw_transform"][:, :3, :2].swapaxes(1, 2).reshape(-1, 6), "six_d", "axis_angle")
@@ -256,6 +265,18 @@ class Audio2FacePipeline(AnimationPipeline):
             "identity": self.actor,
             "style": chosen or "the usual emotion",
         }
+
+
+class SolveChannels(Stage):
+    """Channels of the vertices that were generated; :class:`~facediff.pipelines.stages.Direct` may change these."""
+
+    def __init__(self, solve: Callable[[Animation], Animation]) -> None:
+        self.solve = solve
+
+    def whole(self, take: Take) -> None:
+        """Solve for all frames at once."""
+        for sample in take.samples:
+            sample.settle(self.solve(sample.animation()))
 
 
 class Audio2FaceStream:

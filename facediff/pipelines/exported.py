@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 from facediff.animation.files import facts_of
@@ -16,7 +17,7 @@ from facediff.utils.hub import model_name
 
 if TYPE_CHECKING:
     from facediff.editing.direction import Direction
-    from facediff.pipelines.animate import Array
+    from facediff.pipelines.stages import Array
 
 FIXED = ("sampler", "steps", "guidance", "style_template", "precision", "device")
 """Options that an exported model does not have, since they were decided when it was written."""
@@ -87,16 +88,17 @@ class ExportedPipeline(AnimationPipeline):
         """How many frames the model gives for so many samples of speech."""
         return self.model.clock.frames(samples)
 
-    def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
-        """Absolute points of the whole recording."""
-        motions = []
-        for seed in self.track(seeds, "samples"):
-            motions.append(self.model.motion(speech, self.model.stream(seed=seed, **self._chosen)))
-        yield motions
+    def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
+        """Frames for some speech (S,), and their absolute points part by part."""
+        streams = [self.generator(seed) for seed in seeds]
+        first, *others = streams  # one bar shows how far all of them are
+        progress = partial(self.track, description="seconds of speech")
+        parts = [self.model.parts(speech, first, progress), *(self.model.parts(speech, other) for other in others)]
+        return self.frames_of(len(speech)), zip(*parts, strict=True)
 
-    def generator(self) -> RuntimeStream:
-        """What generates points while speech arrives."""
-        return self.model.stream(seed=self.seed, **self._chosen)
+    def generator(self, seed: int) -> RuntimeStream:
+        """The model at the beginning of a stream."""
+        return self.model.stream(seed=seed, **self._chosen)
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""

@@ -20,6 +20,7 @@ from facediff.errors import OptionError
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of, read_scales
 from facediff.registry import name_of
 from facediff.spaces.rigs import LinearRig
+from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import valid_text
 from facediff.utils.hub import is_audio2face, is_exported, model_name
 from facediff.utils.licences import licence_metadata
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
     from facediff.data import Assets, Reference
     from facediff.editing.direction import Direction
     from facediff.models import AnimationModel, Style
-    from facediff.pipelines.animate import Array
     from facediff.pipelines.directing import DirectedStream
+    from facediff.pipelines.stages import Array
     from facediff.spaces.decoding import ChannelDecoder
 
 
@@ -132,14 +133,13 @@ class TrainedPipeline(AnimationPipeline):
         """How many frames the model gives for so many samples of speech."""
         return self.model.frames_of(samples)
 
-    def generate(self, speech: Array, seeds: Sequence[int]) -> Iterator[Sequence[Array]]:
-        """Absolute vertices: in one part for short speech, by windows for long speech."""
+    def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
+        """Frames, and absolute points: in one part for short speech, by windows for long speech."""
         if not self.windows.in_one_pass(self.frames_of(len(speech)), self.frame_rate):
             stream = self._directed(seeds)
-            for part in stream.parts(speech, progress=partial(self.track, description="seconds of speech")):
-                yield [*part]
             self.style_name = ", ".join(stream.style_names)
-            return
+            parts = stream.parts(speech, progress=partial(self.track, description="seconds of speech"))
+            return round(len(speech) * self.frame_rate / SAMPLE_RATE), map(list, parts)
         import torch
 
         audio, motions = torch.from_numpy(speech).to(self.model.device), []
@@ -157,21 +157,20 @@ class TrainedPipeline(AnimationPipeline):
             motions.append(torch.stack([sample.vertices for sample in samples]))
             styles[samples[0].reference_name] = None
         self.style_name = ", ".join(styles)
-        if len(self.runs) == 1:
-            yield [*motions[0].numpy()]
-        else:
+        if len(self.runs) > 1:
             from facediff.pipelines.directing import blend
 
-            yield [*blend(motions, self.runs, self.frame_rate).numpy()]
+            motions = [blend(motions, self.runs, self.frame_rate)]
+        return motions[0].shape[1], iter([[*motions[0].numpy()]])
 
     @property
     def stream_timing(self) -> tuple[float, float]:
         """That of the model's own windows, where it has such."""
         return self.model.stream_timing or super().stream_timing
 
-    def generator(self) -> FirstSample:
-        """What generates points while speech arrives."""
-        return FirstSample(self._directed([self.seed]))
+    def generator(self, seed: int) -> FirstSample:
+        """The model at the beginning of a stream."""
+        return FirstSample(self._directed([seed]))
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""

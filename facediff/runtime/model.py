@@ -6,7 +6,7 @@ model (:mod:`facediff.pipelines`), so that most programs want :func:`facediff.lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -77,21 +77,37 @@ class RuntimeModel(ExportedGraphs):
             audio: speech at 16 kHz.
             stream: at its beginning; it says who moves, and how.
         """
+        return np.concatenate(list(self.parts(audio, stream)))
+
+    def parts(
+        self,
+        audio: Array,
+        stream: RuntimeStream,
+        progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+    ) -> Iterator[Array]:
+        """The same part by part: all of a short recording at once, a long one by windows.
+
+        Args:
+            audio: speech at 16 kHz.
+            stream: at its beginning; it says who moves, and how.
+            progress: wraps the iteration over the seconds of a long recording.
+        """
         audio = np.ascontiguousarray(audio, np.float32)
         if audio.ndim != 1 or not np.isfinite(audio).all():
             raise FaceDiffError(f"audio: is {audio.dtype} {audio.shape}; expected finite samples (S,) at 16 kHz")
         frames = self.clock.frames(len(audio))
         if frames < 1:
             raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
-        if self.windows.in_one_pass(frames, self.frame_rate):
-            length = samples_for(frames, self.frame_rate) if self.clock.rule == "rounded" else len(audio)
-            samples = np.pad(audio[:length], (0, max(0, length - len(audio))))
-            # In the precision of the model, which standardises in float32.
-            mean = samples.mean(dtype=np.float32)
-            deviation = np.sqrt(np.square(samples - mean).mean(dtype=np.float32) + np.float32(self.description.epsilon))
-            speech = WindowSpeech(samples, frames, float(mean), float(deviation))
-            return stream.joined([clip_motion(self, speech, stream.conditions)])
-        return np.concatenate(list(stream.parts(audio, frames=frames)))
+        if not self.windows.in_one_pass(frames, self.frame_rate):
+            yield from stream.parts(audio, frames=frames, progress=progress)
+            return
+        length = samples_for(frames, self.frame_rate) if self.clock.rule == "rounded" else len(audio)
+        samples = np.pad(audio[:length], (0, max(0, length - len(audio))))
+        # In the precision of the model, which standardises in float32.
+        mean = samples.mean(dtype=np.float32)
+        deviation = np.sqrt(np.square(samples - mean).mean(dtype=np.float32) + np.float32(self.description.epsilon))
+        speech = WindowSpeech(samples, frames, float(mean), float(deviation))
+        yield stream.joined([clip_motion(self, speech, stream.conditions)])
 
     def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> RuntimeStream:  # noqa: ANN401
         """Animate speech of any length while it arrives.
