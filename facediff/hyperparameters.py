@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import fields, replace
 from enum import Enum
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from facediff.errors import FaceDiffError
-from facediff.registry import alias_path
+from facediff.registry import COMPONENTS, alias_path
 from facediff.utils import hints
 from facediff.utils.hints import checks_arguments, defaults, is_path, options_of
 from facediff.utils.limits import quoted
+
+Options = TypeVar("Options")
 
 Components = Mapping[str, Callable[[str], type | None]]
 """For each kind of component, what finds a class by its import path; None if it is not known."""
@@ -176,3 +179,61 @@ def unknown_class(source: object, role: str, named: object) -> FaceDiffError:
         f'{source}: its {role} is "{shown}", which is not known; it was not loaded. If you trust the file, install or '
         f"import the package that the {role} comes from{own}"
     )
+
+
+def takes_options(group: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a constructor take the fields of a dataclass as keyword arguments of its own.
+
+    The constructor itself receives them as an instance of the dataclass, in front of its other options. Its signature
+    and its docstring are those of the fields, so that the command line, checkpoints and documentation show each option.
+
+    Args:
+        group: a dataclass with a default for every field.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(kw_only=True)
+        ... class Size:
+        ...     width: int = 2
+        >>> class Box:
+        ...     @takes_options(Size)
+        ...     def __init__(self, size: Size, **common: int) -> None:
+        ...         self.size = size
+        >>> Box(width=3).size
+        Size(width=3)
+        >>> list(inspect.signature(Box).parameters)
+        ['width', 'common']
+    """
+    hints_by_name = hints.hints_of(group)
+
+    def decorate(init: Callable[..., None]) -> Callable[..., None]:
+        @wraps(init)
+        def wrapped(self: Any, **arguments: Any) -> None:  # noqa: ANN401
+            options = {name: arguments.pop(name) for name in hints_by_name.keys() & arguments.keys()}
+            init(self, group(**options), **arguments)
+
+        first, *_, common = inspect.signature(init).parameters.values()
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        options = [
+            inspect.Parameter(field.name, keyword, default=field.default, annotation=hints_by_name[field.name])
+            for field in fields(group)
+        ]
+        wrapped.__signature__ = inspect.Signature([first, *options, common])  # type: ignore[attr-defined]
+        wrapped.__annotations__ = dict(hints_by_name)
+        wrapped.__doc__ = group.__doc__
+        return wrapped
+
+    return decorate
+
+
+def with_classes(options: Options) -> Options:
+    """A model's options with each component's class in place of what makes the component, for a model to keep.
+
+    What the command line makes components with holds the parser, and with it the trainer and its processes, which
+    weight averaging would copy together with the model.
+
+    Args:
+        options: a dataclass; a field of a kind's name holds a component.
+    """
+    components = {field.name for field in fields(options)} & COMPONENTS.keys()
+    return replace(options, **{name: component_class(getattr(options, name)) for name in components})

@@ -70,7 +70,10 @@ def options_of(entry: Entry) -> list[str]:
         return []
     meanings: dict[str, str] = {}
     for base in reversed(inspect.getmro(entry.implementation)):  # a class describes only options of its own
-        parsed = docstring_parser.parse(base.__doc__ or "", docstring_parser.DocstringStyle.GOOGLE)
+        text = base.__doc__ or ""
+        if (init := vars(base).get("__init__")) is not None and "Args:" in (init.__doc__ or ""):
+            text = init.__doc__  # of a constructor that takes the options of a dataclass
+        parsed = docstring_parser.parse(text, docstring_parser.DocstringStyle.GOOGLE)
         meanings |= {option.arg_name: plain_text(option.description or "") for option in parsed.params}
     lines = []
     for name, parameter in inspect.signature(entry.implementation).parameters.items():

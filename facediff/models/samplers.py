@@ -130,37 +130,11 @@ class NoiseProcess:
             batch: how many.
             device: where they are drawn.
             generator: random numbers.
-            weights: probabilities of the steps, such as those of :meth:`even_in_log_snr`; all alike if None.
+            weights: probabilities of the steps, such as those of the dual path's recipe; all alike if None.
         """
         if weights is not None:
             return torch.multinomial(weights.to(device), batch, replacement=True, generator=generator)
         return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
-
-    def even_in_log_snr(self, hidden: Float[Tensor, " steps"]) -> Float[Tensor, " steps"]:
-        """Probabilities of the steps that spread a training over the levels of noise at which motion is decided.
-
-        Where neighbouring frames tell a noisy one, speech is needed in the noisiest few per cent of the steps alone,
-        and there a sampler takes half of its steps. Of the draws, 85 % are uniform in ln SNR, from where noise leaves
-        a two-hundredth of the motion open to where it leaves 70 %; the others are uniform over all steps.
-
-        Args:
-            hidden: the share of the motion that noise leaves open in each step, rising.
-        """
-        signal = self.signal.cpu().double()
-        level = (signal / (1 - signal)).log()
-        # A step stands for the levels up to half way to its neighbours.
-        middle = (level[:-1] + level[1:]) / 2
-        borders = torch.cat([level[:1], middle, level[-1:]])
-        first, last = (int((hidden < share).sum()) for share in SPREAD)
-        top, bottom = level[min(first, self.steps - 1)], level[min(last, self.steps - 1)]
-        width = (borders[:-1].clamp(bottom, top) - borders[1:].clamp(bottom, top)).clamp_min(0)
-        even = torch.full_like(width, 1 / self.steps)
-        total = width.sum()
-        return (even if total == 0 else 0.85 * width / total + 0.15 * even).float()
-
-
-SPREAD = (0.005, 0.7)
-"""Shares of the motion that noise leaves open, between which training steps are uniform in ln SNR."""
 
 
 def half_hidden(
@@ -335,7 +309,7 @@ class Sampler(ABC):
         last_noise: noise left at the last of them, see :func:`visited`.
         first_noise: noise from which ``log_snr`` is spread, see :func:`visited`.
         spread: what the noise is multiplied by where the first step goes on from it, and the distance of the result
-            from the first prediction, which is the mean; few steps vary too little, see :func:`widened`.
+            from the first prediction, which is the mean; few steps vary too little.
 
     Attributes:
         timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.

@@ -480,7 +480,7 @@ def options_of(owner: type) -> dict[str, inspect.Parameter]:
             continue
         declared = list(inspect.signature(init).parameters.values())[1:]
         named = [p for p in declared if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
-        hints = hints_of(inspect.unwrap(init))
+        hints = hints_of(init)
         parameters = {p.name: p.replace(annotation=hints.get(p.name, Any)) for p in named} | parameters
         if all(p.kind is not p.VAR_KEYWORD for p in declared):
             break

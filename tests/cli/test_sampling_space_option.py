@@ -21,7 +21,7 @@ def test_it_is_chosen_at_test_time(
     real = DualPathDiffusion.generate
 
     def generate(self: DualPathDiffusion, *given: object, **named: object) -> object:
-        seen.append(self.sampling_space)
+        seen.append(self.options.sampling_space)
         return real(self, *given, **named)
 
     monkeypatch.setattr(DualPathDiffusion, "generate", generate)

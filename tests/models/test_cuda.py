@@ -51,7 +51,7 @@ def test_motion_of_a_gpu_is_that_of_the_processor(
     space: str, pair: tuple[DualPathDiffusion, DualPathDiffusion, Batch]
 ) -> None:
     model, twin, batch = pair
-    model.sampling_space = twin.sampling_space = space  # type: ignore[assignment]
+    model.options.sampling_space = twin.options.sampling_space = space  # type: ignore[assignment]
     mine = model.generate(batch, seed=3)
     theirs = twin.generate(batch.to("cuda"), seed=3).cpu()
     torch.testing.assert_close(theirs, mine, rtol=1e-2, atol=1e-2 * float(mine.abs().max()))

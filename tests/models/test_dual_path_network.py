@@ -15,7 +15,7 @@ from facediff.data import collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.decoders import Decoder
-from facediff.models.dual_path.network import Conditions
+from facediff.models.dual_path.conditioning import Conditions
 from facediff.models.folding import ConditionalDenoiser
 from tests.fakes.tiny import Tiny
 

@@ -11,7 +11,7 @@ from jaxtyping import TypeCheckError
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.models.dual_path.network import StyleTokens
+from facediff.models.dual_path.conditioning import StyleTokens
 from facediff.models.mesh_encoders import SpiralDown
 from facediff.models.style_content.network import WindowedTransformer
 from tests.fakes.onnx_nodes import recurrent_node

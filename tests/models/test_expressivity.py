@@ -87,12 +87,12 @@ def test_mean_is_the_average_prediction_from_noise_and_its_negative(
     monkeypatch.setattr(VertexSpace, "noise", lambda space, unit: start)
     monkeypatch.setattr(FoldedSpace, "noise", lambda space, unit: start @ space._embed.weight.T)
     for space in ("vertices", "folded"):
-        model.sampling_space = space
+        model.options.sampling_space = space
         found = model.generate(batch, expressivity=0.0)
         torch.testing.assert_close(found[batch.mask], expected[batch.mask], rtol=0, atol=1e-9)
     samples = []
     for space in ("vertices", "folded"):
-        model.sampling_space = space
+        model.options.sampling_space = space
         samples.append(model.generate(batch, expressivity=0.3)[batch.mask])
     torch.testing.assert_close(samples[0], samples[1], rtol=0, atol=1e-9)
 

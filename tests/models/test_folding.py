@@ -189,7 +189,7 @@ def test_folded_sampling_gives_the_same_mean_and_covariance_for_new_noise(ready:
     clips = 3000
 
     def motions(space: str, seed: int) -> Tensor:
-        model.sampling_space = space
+        model.options.sampling_space = space
         tensors = {k: v for k, v in vars(one).items() if isinstance(v, Tensor)}
         many = {k: v.expand(clips, *v.shape[1:]) for k, v in tensors.items()}
         lists = {

@@ -14,7 +14,7 @@ from facediff import registry
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
-from facediff.models.dual_path.network import Hidden
+from facediff.models.dual_path.conditioning import Hidden
 from facediff.models.folding import FoldedSpace, VertexSpace
 from facediff.speech.windows import WindowPlan
 from tests.fakes.tiny import Tiny
@@ -184,7 +184,7 @@ def test_a_hidden_identity_is_a_strangers(ready: Ready, batch: Batch) -> None:
     strangers = replace(batch, identity=torch.full_like(batch.identity, -1))
 
     def condition(share: float, clips: Batch) -> torch.Tensor:
-        model.identity_dropout = share
+        model.options.identity_dropout = share
         return model.conditions(clips).style
 
     torch.testing.assert_close(condition(1.0, batch), condition(0.0, strangers))
@@ -194,7 +194,7 @@ def test_a_hidden_identity_is_a_strangers(ready: Ready, batch: Batch) -> None:
 def test_learnt_stand_ins_get_a_gradient_in_every_step(ready: Ready, batch: Batch) -> None:
     model = ready().train()
     for share in (0.0, 1.0):
-        model.speech_dropout = model.style_dropout = model.identity_dropout = max(share, 1e-12)
+        model.options.speech_dropout = model.options.style_dropout = model.options.identity_dropout = max(share, 1e-12)
         model.zero_grad()
         model.losses(batch)["loss"].backward()
         for learnt in (model.network.no_speech, model.network.no_style):

@@ -34,7 +34,7 @@ def test_losses_are_those_of_added_and_removed_noise(model: DualPathDiffusion, t
     noisy = model.process.add_noise(clean, noise, step)
     predicted = model.network(noisy, step, model.conditions(batch)).view(batch.motion.shape)
     truth, upper = clean.view(batch.motion.shape), model.assets.regions["upper_face"]
-    expected = losses.training_losses(predicted, truth, batch.mask, upper, model.loss_weights)
+    expected = losses.training_losses(predicted, truth, batch.mask, upper, model.options.loss_weights)
     torch.testing.assert_close(terms, expected, rtol=1e-5, atol=1e-6)
     parameters = [p for p in model.parameters() if p.requires_grad]
     found, wanted = (torch.autograd.grad(each["loss"], parameters, allow_unused=True) for each in (terms, expected))
@@ -64,7 +64,7 @@ def test_losses_of_several_draws_are_the_mean_of_each(
 
 def test_a_training_step_noises_each_clip_as_often_as_asked(model: DualPathDiffusion, tiny: Tiny) -> None:
     seen: list[int] = []
-    model.noise_draws = 3
+    model.options.noise_draws = 3
     at = model.losses_at
 
     def count(batch: Batch, step: torch.Tensor, noise: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -97,7 +97,7 @@ def model(
 def test_frames_that_are_given_out_do_not_change(model: DualPathDiffusion) -> None:
     """Each window sees the motion that was given out, and goes on from it."""
     model.choose_low_latency()
-    decode, given, looked = model._motion, [], 0
+    decode, given, looked = model.decode, [], 0
 
     def spied(space, sample, wanted):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
         nonlocal looked
@@ -108,7 +108,7 @@ def test_frames_that_are_given_out_do_not_change(model: DualPathDiffusion) -> No
         given.append(whole[0, first])
         return whole[:, wanted]
 
-    model._motion = spied  # type: ignore[method-assign]
+    model.decode = spied  # type: ignore[method-assign]
     speech = torch.randn(2 * 16_000, generator=torch.Generator().manual_seed(0)) * 0.2
     made = model.animate(speech, identity=model.identities[0]).vertices
     assert len(given) == len(made) == 50

@@ -19,9 +19,10 @@ from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.adaptation import with_extra_identities
+from facediff.models.dual_path.recipe import log_snr_weights, noise_scale_for
 from facediff.models.losses import preconditioned_losses
 from facediff.models.motion_space import ComponentMotion, Preconditioning, TemporalPreconditioning
-from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler, half_hidden
+from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., Any]
@@ -173,7 +174,7 @@ def test_training_steps_follow_from_what_noise_hides(make_model: Make, make_trai
     )
     model.losses(next(iter(tiny.val_dataloader())))
     assert model.motion_space.preconditioning is not None
-    expected = model.process.even_in_log_snr(model.motion_space.preconditioning.hidden())
+    expected = log_snr_weights(model.process, model.motion_space.preconditioning.hidden())
     torch.testing.assert_close(drawn[0], expected)
 
 
@@ -188,7 +189,7 @@ def test_training_steps_do_not_follow_what_a_validation_sees(make_model: Make, t
     for training, size in ((False, 9.0), (True, 0.1), (False, 9.0), (True, 0.1), (True, 0.1)):
         scales.fit(model.process.signal, torch.full((4,), size), torch.ones(4))
         model.train(training).losses(batch)
-        torch.testing.assert_close(drawn[-1], model.process.even_in_log_snr(scales.hidden()))
+        torch.testing.assert_close(drawn[-1], log_snr_weights(model.process, scales.hidden()))
     assert not torch.allclose(drawn[0], drawn[1])
 
 
@@ -393,12 +394,12 @@ def test_noise_far_smaller_than_motion_is_never_none() -> None:
 
 def test_the_noise_scale_hides_half_of_the_variance() -> None:
     variances = torch.tensor([900.0, 30.0, 2.0, 0.1])
-    scale = half_hidden(variances)
+    scale = noise_scale_for(variances)
     shown = scale**2 * variances / (scale**2 * variances + 1)
     assert float((variances * shown).sum() / variances.sum()) == pytest.approx(0.5, abs=1e-5)
-    assert half_hidden(4 * variances) == pytest.approx(scale / 2)
+    assert noise_scale_for(4 * variances) == pytest.approx(scale / 2)
     # White motion of which the components count differently.
-    assert half_hidden(torch.ones(4), variances) == pytest.approx(1.0)
+    assert noise_scale_for(torch.ones(4), variances) == pytest.approx(1.0)
 
 
 def test_preconditioned_losses_are_their_formulas_and_padding_never_counts() -> None:
@@ -585,7 +586,7 @@ def test_the_noise_scale_is_measured_by_the_64_largest_components(
     if scale == "auto":
         variances = (2 * sizes[:64]).square()
         seen = model.motion_space.noised_variances(variances)
-        assert model.process.scale == pytest.approx(half_hidden(seen, variances), rel=1e-4)
+        assert model.process.scale == pytest.approx(noise_scale_for(seen, variances), rel=1e-4)
 
 
 def test_lips_and_upper_face_count_by_their_own_weights(make_model: Make, tiny: Tiny) -> None:

@@ -11,7 +11,8 @@ import torch
 from torch import nn
 
 from facediff import registry
-from facediff.models.dual_path.network import Conditions, DualPathNetwork, StepEmbedding
+from facediff.models.dual_path.conditioning import Conditions
+from facediff.models.dual_path.network import DualPathNetwork, StepEmbedding
 
 Array = np.ndarray
 DIM, HEADS = 16, 4

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from facediff import registry
 from facediff.models import samplers
+from facediff.models.dual_path.recipe import log_snr_weights
 from facediff.models.samplers import SCHEDULES, DpmSolverSampler, NoiseProcess, Sampler, unit_noise
 
 
@@ -78,7 +79,7 @@ def test_steps_are_even_in_log_snr_where_noise_hides_part_of_the_motion() -> Non
     signal = process.signal.double().numpy()
     level = np.log(signal / (1 - signal))
     hidden = 1 / (1 + 300 * signal / (1 - signal))  # of Gaussian motion of variance 300
-    weights = process.even_in_log_snr(torch.from_numpy(hidden)).double().numpy()
+    weights = log_snr_weights(process, torch.from_numpy(hidden)).double().numpy()
     np.testing.assert_allclose(weights.sum(), 1, rtol=1e-5)
     among = (hidden >= 0.005) & (hidden < 0.7)
     first, last = np.flatnonzero(among)[[0, -1]]  # the steps next to these have a part of the way to them
@@ -95,7 +96,7 @@ def test_steps_are_even_in_log_snr_where_noise_hides_part_of_the_motion() -> Non
 
 def test_steps_are_even_where_noise_hides_everything_or_nothing() -> None:
     for hidden in (torch.zeros(10), torch.ones(10)):
-        torch.testing.assert_close(NoiseProcess(10).even_in_log_snr(hidden), torch.full((10,), 0.1))
+        torch.testing.assert_close(log_snr_weights(NoiseProcess(10), hidden), torch.full((10,), 0.1))
 
 
 def test_unit_noise_does_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:

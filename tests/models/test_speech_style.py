@@ -15,7 +15,7 @@ from facediff.data import Batch
 from facediff.models import DualPathDiffusion
 from facediff.models.adaptation import with_extra_identities
 from facediff.models.dual_path.graphs import StepGraph
-from facediff.models.dual_path.network import MEMORY, REACH, RIDGE, SpeechStyle
+from facediff.models.dual_path.speech_style import MEMORY, REACH, RIDGE, SpeechStyle
 from facediff.speech.windows import WindowPlan
 from tests.fakes.tiny import Tiny
 

@@ -109,13 +109,16 @@ def layer(x: Array, context: Array, w: dict[str, Array], name: str, heads: int) 
     return x + linear(hidden, w, f"{name}.feed_forward.1.3")
 
 
+@pytest.mark.parametrize("query", ["encoded", "input"])
 @pytest.mark.parametrize(
     ("window", "ratio", "steps", "frames"), [(7, 1.0, 10, 10), (8, 5 / 3, 17, 10), (32, 5 / 3, 20, 12)]
 )
-def test_the_speech_branch_asks_with_the_middle_step(window: int, ratio: float, steps: int, frames: int) -> None:
+def test_the_speech_branch_asks_with_the_middle_step(
+    window: int, ratio: float, steps: int, frames: int, query: str
+) -> None:
     """For every frame the W features around its centre, zeros past the ends, encoded; the middle one is the query."""
     torch.manual_seed(1)
-    part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=window, num_heads=2, num_layers=2)
+    part = WindowedTransformer(in_dim=6, dim=8, out_dim=5, window=window, num_heads=2, num_layers=2, query=query)  # type: ignore[arg-type]
     with torch.no_grad():
         for parameter in part.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
@@ -129,10 +132,11 @@ def test_the_speech_branch_asks_with_the_middle_step(window: int, ratio: float, 
             step = middle - window // 2 + place
             if 0 <= step < steps:
                 source[place] = double(features)[0, step]
-        x = linear(source, w, "embed") + w["positions"]
+        x = embedded = linear(source, w, "embed") + w["positions"]
         for number in range(2):
             x = layer(x, x, w, f"layers.{number}", 2)
-        answer = layer(x[window // 2 : window // 2 + 1], x, w, "query", 2)
+        asking = x if query == "encoded" else embedded
+        answer = layer(asking[window // 2 : window // 2 + 1], x, w, "query", 2)
         expected = linear(norm(answer, w, "out.0"), w, "out.1")[0]
         np.testing.assert_allclose(made[frame], expected, rtol=1e-4, atol=1e-4)
 

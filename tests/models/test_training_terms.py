@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch, collate
 from facediff.models import DualPathDiffusion
-from facediff.models.dual_path.network import StyleTokens
+from facediff.models.dual_path.conditioning import StyleTokens
 from facediff.models.motion_space import ComponentMotion
 from tests.fakes.tiny import VERTICES, Tiny
 
@@ -179,7 +179,7 @@ def test_losses_in_components_are_their_formulas(make_model: Make, tiny: Tiny, b
         ]
         terms[name] = np.concatenate(errors).mean()
         assert float(found[name].detach()) == pytest.approx(terms[name], rel=1e-3)
-    loss = sum(model.loss_weights[name] * value for name, value in terms.items())
+    loss = sum(model.options.loss_weights[name] * value for name, value in terms.items())
     assert float(found["loss"].detach()) == pytest.approx(loss, rel=1e-3)
 
 

@@ -27,7 +27,7 @@ from facediff.data import Assets, Batch, Sample, collate
 from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder, MelEncoder
 from facediff.models.decoders import StyleTransformer
-from facediff.models.dual_path.network import Conditions
+from facediff.models.dual_path.conditioning import Conditions
 from facediff.models.folding import SamplingSpace
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.inference import ClipNoise

@@ -223,7 +223,7 @@ class Bench:
         noisy = model.process.add_noise(clean, noise, step)
         predicted = model.network(noisy, step, model.conditions(batch)).view(batch.motion.shape)
         truth, mask = clean.view(batch.motion.shape), batch.mask
-        return training_losses(predicted, truth, mask, model.assets.regions["upper_face"], model.loss_weights)
+        return training_losses(predicted, truth, mask, model.assets.regions["upper_face"], model.options.loss_weights)
 
 
 def in_turn(bench: Bench, ways: list[Way], rounds: int, clips: int) -> dict[str, dict[str, float]]:

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from facediff.errors import FaceDiffError
-from facediff.models.dual_path.network import Conditions, DualPathNetwork
+from facediff.models.dual_path.conditioning import Conditions
+from facediff.models.dual_path.network import DualPathNetwork
 from facediff.models.folding import Blend, ConditionalDenoiser, unchanged
 from facediff.models.graphs import (
     BATCH,
@@ -86,7 +87,7 @@ class StepGraph(ModelPart[DualPathModel]):
             share: of this window in each frame, 1 where nothing is shared.
         """
         network, kept = self.model.network, list[Tensor]()
-        dynamic = network.heard_style(style, features, mask)
+        dynamic = network.style_from_speech(style, features, mask)
         tokens = network.style_tokens(torch.cat([network.identity_encoder(identity), dynamic], dim=-1))
 
         # Two windows of long speech are joined within the denoising step, so that both go on from one motion. The graph

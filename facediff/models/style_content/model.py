@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,7 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.errors import FaceDiffError
+from facediff.hyperparameters import takes_options, with_classes
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, results_of, speech_graph, style_graphs
@@ -40,19 +42,15 @@ from facediff.models.style_content.losses import (
 from facediff.models.style_content.network import DisentanglementNetwork, StyleContentDecoder, WindowedTransformer
 from facediff.utils.ranges import Range
 
-SPOKEN = ("reconstruction", "swap", "cycle", "swap_dynamics")
+SPEECH_TERMS = ("reconstruction", "swap", "cycle", "swap_dynamics")
 """Terms that the speech network has as well, by the name ``speech_<term>``."""
 
 
-@registry.model.register("StyleContentDisentanglement")
-class StyleContentDisentanglement(AnimationModel):
-    """Personalised speech-driven animation by style-content disentanglement.
+@dataclass(kw_only=True)
+class StyleContentOptions:
+    """Options of :class:`StyleContentDisentanglement`; ablations are one override each.
 
-    Spiral convolutions split motion into content and personal style; one decoder turns content and style into motion,
-    whether the content comes from motion or from speech. Chai, Shao, Weng, Zhou, "Personalized Audio-Driven 3D Facial
-    Animation via Style-Content Disentanglement", IEEE TVCG 2024; the method is also described in a published patent
-    document. Ablations are one override each: ``swap_weight=0``, ``cycle_weight=0``, ``aligned_pairs=false``,
-    ``speech_content_weight=0``.
+    ``swap_weight=0``, ``cycle_weight=0``, ``aligned_pairs=false`` and ``speech_content_weight=0``.
 
     Args:
         dim: channels of speech features and of motion features before the style encoder.
@@ -84,6 +82,8 @@ class StyleContentDisentanglement(AnimationModel):
         cycle_weight: of swapping twice.
         swap_dynamics_weight: of the swapped upper face's spread over time against the partner's.
         speech_weight: factor of the same terms with content from speech.
+        speech_query: what asks the window for the content of its middle frame: the ``encoded`` feature in the middle,
+            or the ``input`` feature, as the patent words it.
         speech_style: the style that content from speech is decoded with in training: of another clip of the speaker,
             as in animation, or the clip's own, as content from motion is.
         content_pull: how contents are compared: their mean squared difference as a share of their variance, or as it
@@ -97,98 +97,114 @@ class StyleContentDisentanglement(AnimationModel):
         velocity_weight: of velocities within it.
         lip_gap_weight: of the gap between the inner lips within it.
         weight_decay: decoupled weight decay.
-        options: those of every model, see :class:`facediff.models.AnimationModel`.
     """
 
-    def __init__(
-        self,
-        *,
-        dim: Width = 64,
-        content_dim: Width = 64,
-        audio_encoder: AudioEncoderFactory = MelEncoder,
-        mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder,
-        style_encoder: StyleEncoderFactory = LstmStyle,
-        window_seconds: Annotated[float, Range(0, 10)] = 0.64,
-        speech_rate: Annotated[float, Range(1, 1000)] | None = None,
-        speech_layers: Annotated[int, Range(0, 256)] = 3,
-        speech_heads: Heads = 4,
-        decoder_channels: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (64, 128, 256),
-        decoder_kernels: Annotated[Sequence[int], Range(1, 1000, items=(0, 32))] = (5, 3, 3),
-        decoder_hidden: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (256, 256, 128),
-        basis_size: Width = 50,
-        content_scale: Literal["clip", "free"] = "clip",
-        vertices: Literal["all", "face"] = "all",
-        aligned_pairs: bool = True,
-        aligned_windows: bool = False,
-        window_context: bool = False,
-        swap_region: Literal["lower_face", "face"] = "lower_face",
-        reconstruction_weight: Weight = 1.0,
-        swap_weight: Weight = 3.0,
-        cycle_weight: Weight = 1.0,
-        swap_dynamics_weight: Weight = 3.0,
-        speech_weight: Weight = 2.0,
-        speech_style: Literal["other_clip", "own"] = "other_clip",
-        content_pull: Literal["relative", "squared"] = "relative",
-        style_pull: Literal["contrast", "squared"] = "contrast",
-        recording_content_weight: Weight = 5.0,
-        identity_style_weight: Weight = 10.0,
-        speech_content_weight: Weight = 5.0,
-        position_weight: Weight = 1.0,
-        velocity_weight: Weight = 5.0,
-        lip_gap_weight: Weight = 1.0,
-        weight_decay: Decay = 0.0,
-        **options: Any,  # noqa: ANN401
-    ) -> None:
-        super().__init__(weight_decay=weight_decay, **options)
-        self.aligned_pairs = aligned_pairs
-        self.aligned_windows = aligned_windows
-        self.window_context = window_context
-        self.speech_style = speech_style
-        self.content_distance = relative_distance if content_pull == "relative" else squared_distance
-        self.style_pull = style_contrast if style_pull == "contrast" else style_distance
-        self.swap_region = swap_region
-        self.weights = {
-            "reconstruction": reconstruction_weight,
-            "swap": swap_weight,
-            "cycle": cycle_weight,
-            "swap_dynamics": swap_dynamics_weight,
-            "recording_content": recording_content_weight,
-            "identity_style": identity_style_weight,
-            "speech_content": speech_content_weight,
+    dim: Width = 64
+    content_dim: Width = 64
+    audio_encoder: AudioEncoderFactory = MelEncoder
+    mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder
+    style_encoder: StyleEncoderFactory = LstmStyle
+    window_seconds: Annotated[float, Range(0, 10)] = 0.64
+    speech_rate: Annotated[float, Range(1, 1000)] | None = None
+    speech_layers: Annotated[int, Range(0, 256)] = 3
+    speech_heads: Heads = 4
+    decoder_channels: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (64, 128, 256)
+    decoder_kernels: Annotated[Sequence[int], Range(1, 1000, items=(0, 32))] = (5, 3, 3)
+    decoder_hidden: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (256, 256, 128)
+    basis_size: Width = 50
+    content_scale: Literal["clip", "free"] = "clip"
+    vertices: Literal["all", "face"] = "all"
+    aligned_pairs: bool = True
+    aligned_windows: bool = False
+    window_context: bool = False
+    swap_region: Literal["lower_face", "face"] = "lower_face"
+    reconstruction_weight: Weight = 1.0
+    swap_weight: Weight = 3.0
+    cycle_weight: Weight = 1.0
+    swap_dynamics_weight: Weight = 3.0
+    speech_weight: Weight = 2.0
+    speech_query: Literal["encoded", "input"] = "encoded"
+    speech_style: Literal["other_clip", "own"] = "other_clip"
+    content_pull: Literal["relative", "squared"] = "relative"
+    style_pull: Literal["contrast", "squared"] = "contrast"
+    recording_content_weight: Weight = 5.0
+    identity_style_weight: Weight = 10.0
+    speech_content_weight: Weight = 5.0
+    position_weight: Weight = 1.0
+    velocity_weight: Weight = 5.0
+    lip_gap_weight: Weight = 1.0
+    weight_decay: Decay = 0.0
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """The weight of every term; those of (4.2) are the same terms with the factor ``speech_weight``."""
+        weights = {
+            "reconstruction": self.reconstruction_weight,
+            "swap": self.swap_weight,
+            "cycle": self.cycle_weight,
+            "swap_dynamics": self.swap_dynamics_weight,
+            "recording_content": self.recording_content_weight,
+            "identity_style": self.identity_style_weight,
+            "speech_content": self.speech_content_weight,
         }
-        self.weights |= {f"speech_{term}": speech_weight * self.weights[term] for term in SPOKEN}
-        self.distance = MotionDistance(position_weight, velocity_weight, lip_gap_weight)
+        return weights | {f"speech_{term}": self.speech_weight * weights[term] for term in SPEECH_TERMS}
+
+
+@registry.model.register("StyleContentDisentanglement")
+class StyleContentDisentanglement(AnimationModel):
+    """Personalised speech-driven animation by style-content disentanglement.
+
+    Spiral convolutions split motion into content and personal style; one decoder turns content and style into motion,
+    whether the content comes from motion or from speech. Chai, Shao, Weng, Zhou, "Personalized Audio-Driven 3D Facial
+    Animation via Style-Content Disentanglement", IEEE TVCG 2024; the method is also described in a published patent
+    document, whose steps (4.1) and (4.2) are :meth:`losses`.
+
+    Args:
+        options: those of :class:`StyleContentOptions` as keyword arguments, and those of every model
+            (:class:`facediff.models.AnimationModel`).
+    """
+
+    @takes_options(StyleContentOptions)
+    def __init__(self, options: StyleContentOptions, **common: Any) -> None:  # noqa: ANN401
+        super().__init__(weight_decay=options.weight_decay, **common)
+        self.options = with_classes(options)
+        relative, contrast = options.content_pull == "relative", options.style_pull == "contrast"
+        self.content_distance = relative_distance if relative else squared_distance
+        self.style_pull = style_contrast if contrast else style_distance
+        self.distance = MotionDistance(options.position_weight, options.velocity_weight, options.lip_gap_weight)
         self.alignments = Alignments(self.frame_rate)
-        style = style_encoder(dim=dim)
+        dim, content_dim, points = options.dim, options.content_dim, {"n_vertices": self.n_vertices, "dims": self.dims}
+        rate = options.speech_rate or self.frame_rate
+        style = options.style_encoder(dim=dim)
         if not style.token_dims:
             raise FaceDiffError("style_encoder: this model needs a style; choose another style encoder, such as lstm")
         self.network = DisentanglementNetwork(
-            content_encoder=mesh_encoder(dim=content_dim, n_vertices=self.n_vertices, dims=self.dims),
-            style_frames=mesh_encoder(dim=dim, n_vertices=self.n_vertices, dims=self.dims),
+            content_encoder=options.mesh_encoder(dim=content_dim, **points),
+            style_frames=options.mesh_encoder(dim=dim, **points),
             style_encoder=style,
-            audio_encoder=audio_encoder(dim=dim),
+            audio_encoder=options.audio_encoder(dim=dim),
             speech_content=WindowedTransformer(
                 in_dim=dim,
                 dim=dim,
                 out_dim=content_dim,
-                window=max(1, round(window_seconds * (speech_rate or self.frame_rate))),
-                num_heads=speech_heads,
-                num_layers=speech_layers,
+                window=max(1, round(options.window_seconds * rate)),
+                num_heads=options.speech_heads,
+                num_layers=options.speech_layers,
+                query=options.speech_query,
             ),
             decoder=StyleContentDecoder(
-                n_vertices=self.n_vertices,
-                dims=self.dims,
+                **points,
                 content_dim=content_dim,
                 style_dim=sum(style.token_dims),
-                channels=decoder_channels,
-                kernels=decoder_kernels,
-                hidden=decoder_hidden,
-                basis_size=basis_size,
+                channels=options.decoder_channels,
+                kernels=options.decoder_kernels,
+                hidden=options.decoder_hidden,
+                basis_size=options.basis_size,
             ),
-            standardise_content=content_scale == "clip",
-            speech_rate=speech_rate,
+            standardise_content=options.content_scale == "clip",
+            speech_rate=options.speech_rate,
             frame_rate=self.frame_rate,
-            n_vertices=self.n_vertices if vertices == "face" else None,
+            n_vertices=self.n_vertices if options.vertices == "face" else None,
         )
 
     def personal_modules(self) -> list[nn.Module]:
@@ -202,8 +218,8 @@ class StyleContentDisentanglement(AnimationModel):
         data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if stage == "fit":
             data.pair_sentences = True
-            data.aligner = self.alignments if self.aligned_pairs and self.aligned_windows else None
-            data.window_context = self.context_frames() if self.window_context else (0, 0)
+            data.aligner = self.alignments if self.options.aligned_pairs and self.options.aligned_windows else None
+            data.window_context = self.context_frames() if self.options.window_context else (0, 0)
             if new:
                 mean, shapes = data.principal_motion(self.network.decoder.basis.in_features)
                 self.network.decoder.start_from(mean * self.scale, shapes * self.scale)
@@ -235,30 +251,31 @@ class StyleContentDisentanglement(AnimationModel):
         return before, math.ceil((speech.window - 1 - speech.before) / ratio)
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Reconstruction, swap and cycle with content of motion and of speech, and distances of contents and styles."""
-        network, motion = self.network, batch.motion * self.scale
-        pairing = pair_up(batch, self.alignments if self.aligned_pairs and self.alignment_allowed() else None)
+        """The patent's step (4): the disentanglement network (4.1) and the speech network (4.2), trained together."""
+        network, motion, options = self.network, batch.motion * self.scale, self.options
+        aligned = options.aligned_pairs and self.alignment_allowed()
+        pairing = pair_up(batch, self.alignments if aligned else None)
+        # (4.1) E_C and E_S split motion into content and style.
         content, style = network.content(motion, batch.mask), self.style_of_window(batch, motion)
-        usual = network.style(batch.reference * self.scale, batch.reference_mask)
-        spoken = network.content_of_speech(batch)
+        reference_style = network.style(batch.reference * self.scale, batch.reference_mask)
+        # (4.2) The speech encoder gives content as well, decoded with the style of another clip of the speaker, as
+        # in inference, or with that of the clip itself.
+        speech_content = network.content_of_speech(batch)
+        speech_style = style if options.speech_style == "own" else reference_style
         terms = {
             "recording_content": self.content_distance(content, pairing.of_partner(content), pairing.aligned),
-            "identity_style": self.style_pull(torch.cat([style, usual]), batch.identity_names * 2),
-            "speech_content": self.content_distance(content, spoken, batch.window_mask),
+            "identity_style": self.style_pull(torch.cat([style, reference_style]), batch.identity_names * 2),
+            "speech_content": self.content_distance(content, speech_content, batch.window_mask),
         }
-        # Speech is decoded with the style of another clip of the speaker, as it will be in inference, unless asked not
-        # to be.
-        for prefix, said, own in (
-            ("", content, style),
-            ("speech_", spoken, style if self.speech_style == "own" else usual),
-        ):
-            branch = self.branch_losses(batch, motion, pairing, said, own, style)
-            terms |= {f"{prefix}{name}": term for name, term in branch.items()}
-        terms["loss"] = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
+        # One decoder D and the same terms for both: reconstruction, style swap, cycle.
+        terms |= self.branch_losses(batch, motion, pairing, content, style, style)
+        speech_terms = self.branch_losses(batch, motion, pairing, speech_content, speech_style, style)
+        terms |= {f"speech_{name}": term for name, term in speech_terms.items()}
+        terms["loss"] = torch.stack([options.weights[name] * term for name, term in terms.items()]).sum()
         return terms
 
     def branch_losses(
-        self, batch: Batch, motion: Tensor, pairing: Pairing, content: Tensor, own: Tensor, style: Tensor
+        self, batch: Batch, motion: Tensor, pairing: Pairing, content: Tensor, decoded_style: Tensor, style: Tensor
     ) -> dict[str, Tensor]:
         """Reconstruction, swap and cycle of clips i with partners j.
 
@@ -267,13 +284,14 @@ class StyleContentDisentanglement(AnimationModel):
             motion: M_i, scaled (B, T, V, 3).
             pairing: the partners.
             content: C_i (B, T, content_dim), from motion or from speech.
-            own: the style (B, style_dim) with which C_i must give M_i.
+            decoded_style: the style (B, style_dim) with which C_i must give M_i.
             style: S_i of the motion (B, style_dim); S_j is that of the partner.
         """
         # All valid frames are seen; those that count are fewer where a training window comes with the frames around it.
         network, mask, counted, partner = self.network, batch.mask, batch.window_mask, pairing.partner
         # D(C_i, S_i) ≈ M_i
-        terms = {"reconstruction": self.distance_to(batch, self.decode_scaled(content, own, mask), motion, counted)}
+        rebuilt = self.decode_scaled(content, decoded_style, mask)
+        terms = {"reconstruction": self.distance_to(batch, rebuilt, motion, counted)}
         apart = partner != torch.arange(len(partner), device=partner.device)
         if not apart.any():  # no partners: saves two thirds of the work while one speaker alone is trained
             return {**terms, **dict.fromkeys(("swap", "swap_dynamics", "cycle"), motion.new_zeros(()))}
@@ -282,7 +300,7 @@ class StyleContentDisentanglement(AnimationModel):
         swapped = self.decode_scaled(content, style[partner], mask)
         again, style_again = network.content(swapped, mask), self.style_of_window(batch, swapped)
         # Two people who say the same share the movements of lips and jaw in time, and not those of brows and lids.
-        lower = self.lower_face() if self.swap_region == "lower_face" else None
+        lower = self.lower_face() if self.options.swap_region == "lower_face" else None
         terms["swap"] = self.distance_to(batch, swapped, pairing.of_partner(motion), pairing.aligned, lower)
         free = pairing.unaligned
         # Detached: the swapped motion is to give back the content that went in, and the content must not move towards

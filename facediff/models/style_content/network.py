@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -206,8 +207,8 @@ class WindowedTransformer(nn.Module):
 
     There may be more speech features a second than frames: the middle of frame t's window is the feature m that falls
     on the frame's centre, m = ⌊(t + ½) · features a frame⌋. The window holds features m − ⌊W/2⌋ … m − ⌊W/2⌋ + W − 1,
-    with zeros past the ends of the clip; the query is the encoded feature m itself (style-content disentanglement,
-    "speech animation network").
+    with zeros past the ends of the clip; the query is feature m (style-content disentanglement, "speech animation
+    network").
 
     Args:
         in_dim: channels of the speech features.
@@ -217,6 +218,7 @@ class WindowedTransformer(nn.Module):
         num_heads: attention heads.
         num_layers: encoder layers; one decoder layer follows.
         dropout: dropout everywhere.
+        query: the middle feature as the ``encoded`` sequence has it, or as it is the ``input`` of the encoder.
     """
 
     def __init__(
@@ -229,8 +231,10 @@ class WindowedTransformer(nn.Module):
         num_heads: int = 4,
         num_layers: int = 3,
         dropout: float = 0.0,
+        query: Literal["encoded", "input"] = "encoded",
     ) -> None:
         super().__init__()
+        self.query_encoded = query == "encoded"
         self.window = window
         self.before = window // 2
         self.embed = nn.Linear(in_dim, dim)
@@ -283,11 +287,11 @@ class WindowedTransformer(nn.Module):
         """
         # Every frame's window is a sequence of its own, so that long clips cost time in proportion to their length.
         windows = self.windows(features, frames, ratio, lengths)
-        x = self.embed(windows.flatten(0, 1)) + self.positions
+        embedded = x = self.embed(windows.flatten(0, 1)) + self.positions
         for layer in self.layers:
             x = layer(x, x)
         # The middle feature alone asks, so that the decoder layer costs one query a frame and not a whole window.
-        middle = x[:, self.before : self.before + 1]
+        middle = (x if self.query_encoded else embedded)[:, self.before : self.before + 1]
         return self.out(self.query(middle, x)).view(*windows.shape[:2], -1)
 
 
