@@ -112,6 +112,10 @@ class FaceDiffError(Exception):
         """The same error with the place it comes from, such as a file and its line, in front of the message."""
         return FaceDiffError(f"{place}: {self}")
 
+    def followed_by(self, hint: str) -> FaceDiffError:
+        """The same error with a hint after it; options in the hint stand in braces."""
+        return OptionError.naming(f"{self}{hint}")
+
 
 _OPTION_NAME = re.compile(r"\{([a-z]+(?:_[a-z]+)*)\}")
 

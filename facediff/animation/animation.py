@@ -123,11 +123,12 @@ class Animation:
                     f"{self.name}: its {name} of shape {array.shape} should have {expected}, or holds "
                     f"{OUT_OF_RANGE}; give the mesh that the motion was made for"
                 )
-        if self.faces is not None and len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < count:
-            raise FaceDiffError(
-                f"{self.name}: its triangles name vertex {int(self.faces.max())} of {count}; give the mesh that the "
-                f"motion was made for"
-            )
+        for name, rows in (("triangles", self.faces), ("pairs of inner lips", self.inner_lip_pairs)):
+            if rows is not None and len(rows) and not 0 <= rows.min() <= rows.max() < count:
+                raise FaceDiffError(
+                    f"{self.name}: its {name} refer to vertex {int(rows.max())} of {count}; give the mesh that the "
+                    f"motion was made for"
+                )
         if self.speech is not None and not np.isfinite(self.speech).all():
             raise FaceDiffError(f"{self.name}: its speech holds NaN or infinity; give another recording")
         check_number(self.name, "frame rate", self.frame_rate, *FRAME_RATES)
@@ -215,6 +216,14 @@ class Animation:
         for index, frame in enumerate(self.frames()):
             if not in_range(frame):
                 raise FaceDiffError(f"{self.name}: frame {index} holds {OUT_OF_RANGE}; generate the motion again")
+
+    def speech_16k(self) -> npt.NDArray[np.float32] | None:
+        """The speech (S,) at 16 kHz, as models take it; None for a silent animation."""
+        if self.speech is None or self.sample_rate == SAMPLE_RATE:
+            return self.speech
+        from facediff.speech.audio import to_speech
+
+        return to_speech(self.speech, self.sample_rate, self.name)
 
     def sound(self) -> npt.NDArray[np.float32] | None:
         """The speech (S,) as long as the motion: cut, or padded with silence; None for a silent animation."""

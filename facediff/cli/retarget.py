@@ -93,11 +93,13 @@ def retarget(
     from facediff.editing.blendshapes import has_arkit_weights
     from facediff.export import ExportOptions, check_export, write_animations
     from facediff.export.glb_own_shapes import own_shapes
-    from facediff.mesh.glb import wears_more
+    from facediff.mesh.glb import has_materials_or_targets
     from facediff.pipelines.motion import SourceReader
 
     check_export(output, ExportOptions())
-    dressed = transfer.add_to_mesh or (not transfer.bare_face and holds_glb(output) and wears_more(target_mesh))
+    dressed = transfer.add_to_mesh or (
+        not transfer.bare_face and holds_glb(output) and has_materials_or_targets(target_mesh)
+    )
     if (dressed or transfer.own_shapes) and output.exists() and output.samefile(target_mesh):
         raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
     avatar = own_shapes(target_mesh) if transfer.own_shapes else None
@@ -150,7 +152,7 @@ def write_transferred(
         options.correspondence,
         options.landmarks,
         parts=options.part or (),
-        judge=judge,
+        check=judge,
         whole_head=options.own_shapes,
     )
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
@@ -228,7 +230,7 @@ def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
         return []
     textured = has_textures(mesh)
     if textured and (output.suffix.lower() == ".fbx" or "surface" in FORMATS[output.suffix].uses):
-        return list(read_textures(mesh, len(made.triangles)).lost)
+        return list(read_textures(mesh, len(made.triangles)).losses)
     if is_glb:
         glb = open_glb(mesh)
         if not glb.entries("materials"):

@@ -1,8 +1,7 @@
-"""Acting: brows, head and lids that move with the speech, by rules, on top of what a model generates.
+"""Acting: brows, head and lids that move with the speech by rules, in addition to the model's motion.
 
-From top to bottom: what a kind of acting is, registered under the kind ``acting``; and ``prosody``, which acts on
-accents, stressed syllables and the ends of phrases. Frames come out while speech is heard, the same for a recording and
-for a stream.
+From top to bottom: the base class, registered under the kind ``acting``; and ``prosody``, which acts on accents,
+stressed syllables and the ends of phrases. Frames come out while speech arrives, the same for a recording and a stream.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.editing.hearing import heard
 from facediff.errors import OptionError
 from facediff.registry import UnknownComponentError, acting
 from facediff.speech.prosody import ProsodicEvent, ProsodyTracker
@@ -37,7 +35,7 @@ class Acting(ABC):
     """Moves brows, head and lids with the speech.
 
     Attributes:
-        look_ahead: seconds of speech after a frame that it hears at most before it acts it.
+        look_ahead: largest delay of a frame, in seconds of speech after it.
     """
 
     look_ahead: float = 0.0
@@ -54,11 +52,11 @@ class Acting(ABC):
 
 
 class Performer(ABC):
-    """Acts to one recording, frame by frame; what it does depends on speech up to a short time after a frame only."""
+    """Acts to one recording, frame by frame; a frame depends on speech up to a short time after it."""
 
     @abstractmethod
     def feed(self, samples: Wave) -> Acted:
-        """Hear more (n,) at 16 kHz; the values (m, 5) of the frames that are certain now."""
+        """The values (m, 5) of the frames that are certain with more speech (n,) at 16 kHz."""
 
     @abstractmethod
     def finish(self, frames: int) -> Acted:
@@ -91,7 +89,7 @@ def acted(kind: Acting, speech: Wave, frames: int, frame_rate: float, seed: int)
 
 def act(kind: Acting, animation: Animation, seed: int) -> Acted:
     """The values (T, 5) for an animation with its speech."""
-    speech = heard(animation)
+    speech = animation.speech_16k()
     if speech is None:
         raise OptionError.naming(f"{animation.name}: {{acting}}: has no speech to act on; give it with {{speech}}")
     return acted(kind, speech, len(animation.vertices), animation.frame_rate, seed)
@@ -116,7 +114,7 @@ class ProsodyActing(Acting):
         strength: multiplies brows, nods and drift.
         brows: millimetres that brows rise at the strongest accents.
         nods: degrees of the largest nod.
-        drift: degrees that the head slowly turns and tilts by while somebody speaks, at most.
+        drift: largest angle in degrees of the head's slow turns and tilts during speech.
         blinks: share of phrase ends with a blink.
     """
 
@@ -178,7 +176,7 @@ class _ProsodyPerformer(Performer):
         self._prosody = ProsodyTracker()
         self._frames = 0  # given out
         self._seen = 0  # events that have been turned into gestures
-        # Gestures by what they move: (seconds of the peak's beginning, size).
+        # Gestures by channel: (seconds of the peak's beginning, size).
         self._raises: list[tuple[float, float]] = []
         self._nods: list[tuple[float, float]] = []
         self._turns: list[tuple[float, float, float]] = []
@@ -188,12 +186,12 @@ class _ProsodyPerformer(Performer):
         self._phases = random.uniform(0, 2 * math.pi, (3, len(WAVES))).tolist()
 
     def feed(self, samples: Wave) -> Acted:
-        """Hear more."""
+        """The frames that are certain with more speech."""
         # By the second: the tracker forgets where there was speech, which the frames of a long piece still ask for.
-        acted = [self._hear(samples[first : first + SAMPLE_RATE]) for first in range(0, len(samples), SAMPLE_RATE)]
+        acted = [self._feed(samples[first : first + SAMPLE_RATE]) for first in range(0, len(samples), SAMPLE_RATE)]
         return np.concatenate([np.zeros((0, 5)), *acted])
 
-    def _hear(self, samples: Wave) -> Acted:
+    def _feed(self, samples: Wave) -> Acted:
         self._prosody.feed(samples)
         self._plan()
         return self._up_to(math.floor((self._prosody.certain - AHEAD) * self.frame_rate))
@@ -207,7 +205,7 @@ class _ProsodyPerformer(Performer):
     def _plan(self) -> None:
         """Make gestures of the events that are new."""
         for number, event in enumerate(self._prosody.events, self._seen):
-            # Every event has random numbers of its own, whatever happens before it.
+            # Every event has random numbers of its own, which do not depend on earlier events.
             chance, size, turn, tilt = np.random.default_rng([self.seed, STREAM, number]).random(4).tolist()
             size = (0.6 + 0.4 * size) * event.strength
             self._act(event, chance, size, (2 * turn - 1, 2 * tilt - 1))
@@ -228,7 +226,7 @@ class _ProsodyPerformer(Performer):
 
     def _up_to(self, frames: int) -> Acted:
         """The values of frames up to a number, and forget what no later frame depends on."""
-        values = [self._of(frame / self.frame_rate) for frame in range(self._frames, frames)]
+        values = [self._values(frame / self.frame_rate) for frame in range(self._frames, frames)]
         self._frames = max(frames, self._frames)
         over = self._frames / self.frame_rate - LONGEST
         for gestures in self._planned:
@@ -237,21 +235,22 @@ class _ProsodyPerformer(Performer):
                 gestures.pop(0)
         return np.array(values, np.float64).reshape(-1, 5)
 
-    def _of(self, now: float) -> list[float]:
+    def _values(self, seconds: float) -> list[float]:
         """The values at a time."""
         options = self.options
-        drift = options.drift * self._liveliness(now)
+        drift = options.drift * self._liveliness(seconds)
         wander = [
-            share * sum(math.sin(2 * math.pi * rate * now + phase) for rate, phase in zip(WAVES, phases, strict=True))
+            share
+            * sum(math.sin(2 * math.pi * rate * seconds + phase) for rate, phase in zip(WAVES, phases, strict=True))
             for share, phases in zip(DRIFTS, self._phases, strict=True)
         ]
         pitch, yaw, roll = (drift * angle / len(WAVES) for angle in wander)
-        pitch += options.nods * self._together(self._nods, NOD, now)
+        pitch += options.nods * self._together(self._nods, NOD, seconds)
         for time, turn, tilt in self._turns:
-            far = TURN_SHARE * options.nods * gesture(now - time, TURN)
-            yaw, roll = yaw + far * turn, roll + far * tilt
-        raised = self._together(self._raises, RAISE, now)
-        shut = max((gesture(now - time, BLINK) for time, _ in self._blinks), default=0.0)
+            angle = TURN_SHARE * options.nods * gesture(seconds - time, TURN)
+            yaw, roll = yaw + angle * turn, roll + angle * tilt
+        raised = self._together(self._raises, RAISE, seconds)
+        shut = max((gesture(seconds - time, BLINK) for time, _ in self._blinks), default=0.0)
         return [
             options.strength * options.brows * raised,
             shut,
@@ -260,23 +259,25 @@ class _ProsodyPerformer(Performer):
             options.strength * roll,
         ]
 
-    def _together(self, gestures: list[tuple[float, float]], shape: tuple[float, float, float], now: float) -> float:
-        """Gestures that overlap, together never more than 1."""
+    def _together(
+        self, gestures: list[tuple[float, float]], shape: tuple[float, float, float], seconds: float
+    ) -> float:
+        """Gestures that overlap, limited to 1."""
         left = 1.0
         for time, size in gestures:
             # As probabilities combine: two overlapping rises go further than one, and no number of them beyond the
             # whole way.
-            left *= 1 - size * gesture(now - time, shape)
+            left *= 1 - size * gesture(seconds - time, shape)
         return 1 - left
 
-    def _liveliness(self, now: float) -> float:
-        """How lively the head is, 0 to 1: a weighted share of speech in the time around now."""
-        first, last = (math.floor((now + way * SET_IN) * SAMPLE_RATE / HOP) for way in (-1, 1))
+    def _liveliness(self, seconds: float) -> float:
+        """How lively the head is, 0 to 1: a weighted share of speech around a time."""
+        first, last = (math.floor((seconds + way * SET_IN) * SAMPLE_RATE / HOP) for way in (-1, 1))
         weights = total = 0.0
         for step in range(first, last + 1):
-            away = abs((step + 0.5) * HOP / SAMPLE_RATE - now) / SET_IN
+            away = abs((step + 0.5) * HOP / SAMPLE_RATE - seconds) / SET_IN
             weight = 1 - smoother_step(away)
             total += weight
             weights += weight if step >= 0 and self._prosody.speaks(step) else 0.0
-        # People pause between phrases: who speaks for half of the time is as lively as one gets.
+        # People pause between phrases: speech for half of the time gives the full liveliness.
         return smoother_step(2 * weights / total)

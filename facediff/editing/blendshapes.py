@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.bounded import Problem, minimise, minimise_sparse
+from facediff.editing.expressiveness import ALL, check_factors
 from facediff.editing.shapes import BUILT_IN, ShapeSet, read_shapes
-from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh.mesh import triangle_areas
 from facediff.spaces.arkit import ARKIT, absent_from, beyond_arkit, mirror_pairs
 from facediff.spaces.files.clips import ParameterClip
@@ -51,9 +52,9 @@ class SolveOptions:
         region: name of the animation's region that is looked at; None for the whole face.
         area_weighted: count vertices by the area around them, so that finely meshed places do not count for more;
             without triangles, all count alike.
-        residual_limit: share of the motion, as a root mean square over all frames, above which what the shapes leave of
-            it means that they are not those of this face; 1 or more allows everything.
-        tolerance: what may be left of the optimality conditions, in weights.
+        residual_limit: largest residual as a share of the motion, root mean square over all frames; above it the shapes
+            belong to another face. 1 or more allows everything.
+        tolerance: of the optimality conditions, in weights.
         max_iterations: of Newton's method.
     """
 
@@ -82,11 +83,11 @@ class Weights:
     Attributes:
         names: K names.
         values: (T, K) weights.
-        residual_rms_mm: (T,) root-mean-square distance of each frame's vertices that is left, in millimetres.
+        residual_rms_mm: (T,) root-mean-square residual of each frame's vertices, in millimetres.
         residual_max_mm: (T,) greatest such distance.
         amplitude_mm: the motion's own size: root-mean-square distance of all vertices in all frames from the template.
         frame_rate: frames a second.
-        still: names whose shape moves no vertex, and whose weight therefore says nothing.
+        still: names of shapes that move no vertex, so that their weights mean nothing.
         metadata: the animation's, and how the weights were solved for.
         head: (T, 3) rotation of the head that the weights leave out, axis-angle in radians; None if it does not move.
         eyes: (T, 6) yaw, pitch and roll of the left and the right eye, radians as
@@ -178,11 +179,11 @@ class Weights:
 
     @ranges.checked
     def save(self, path: str | Path, *, plain: bool = False, key_tolerance: ranges.KeyTolerance = 0.0) -> Path:
-        """Write the table, and what it cannot say in a .json next to it.
+        """Write the table, and a .json with further facts next to it.
 
         Args:
             path: the .csv file.
-            plain: columns time, the set's own names and residuals in mm, instead of those of Live Link Face.
+            plain: columns time, the set's own names and residuals in mm, instead of Live Link Face's columns.
             key_tolerance: above 0, the .json gets the keys of each curve that a straight line does not replace to
                 within so much of a weight. The table has a row for each frame.
         """
@@ -221,8 +222,8 @@ def own_weights(animation: Animation) -> Weights:
 
 def has_arkit_weights(animation: Animation) -> bool:
     """Whether an animation has weights of ARKit's shapes, or is of the built-in face, which has such shapes."""
-    own = animation.values is not None and animation.space.kind == "arkit"
-    return own or is_built_in_face(len(animation.template), animation.faces)
+    has_weights = animation.values is not None and animation.space.kind == "arkit"
+    return has_weights or is_built_in_face(len(animation.template), animation.faces)
 
 
 def is_built_in_face(vertices: int, faces: npt.NDArray[np.integer] | None) -> bool:
@@ -268,6 +269,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
             f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give "
             f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
         )
+    animation.refuse_not_finite()
     head, animation = animation.head, animation.still()
     moving = moving_shapes(animation, shapes, options)
     terms = objective(moving, shapes, options, animation.frame_rate)
@@ -290,8 +292,8 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         scaled_weights, converged = minimise(problem, tolerance, options.max_iterations)
     values = np.full((len(right), len(shapes.names)), np.clip(0.0, options.lower, options.upper))
     # Division may lead past a bound by a rounding error.
-    values[:, moving.places] = np.clip(scaled_weights / scale, options.lower, options.upper)
-    rms, most = _residuals(animation, moving, values[:, moving.places])
+    values[:, moving.indices] = np.clip(scaled_weights / scale, options.lower, options.upper)
+    rms, largest = _residuals(animation, moving, values[:, moving.indices])
     millimetres = 1000.0 * metres_per_unit(animation.unit)
     # Over all frames together: a frame in which the face hardly moves has a large share of nothing left.
     remaining = float(np.sqrt(np.square(rms).mean()))
@@ -314,10 +316,10 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         names=shapes.names,
         values=values,
         residual_rms_mm=millimetres * rms,
-        residual_max_mm=millimetres * most,
+        residual_max_mm=millimetres * largest,
         amplitude_mm=millimetres * amplitude,
         frame_rate=animation.frame_rate,
-        still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.places),
+        still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.indices),
         metadata={**animation.metadata, **{f"solve {key}": value for key, value in about.items()}},
         head=None if head is None else head[:, :3],
     )
@@ -354,7 +356,7 @@ def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:
         [0, 2, 3]
     """
     last = len(values) - 1
-    kept, spans = {0, last}, [(0, last)]
+    keys, spans = {0, last}, [(0, last)]
     while spans:
         first, end = spans.pop()
         if end - first < 2:
@@ -366,16 +368,16 @@ def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:
         worst = int(apart.argmax())
         if apart[worst] > tolerance:
             middle = first + 1 + worst
-            kept.add(middle)
+            keys.add(middle)
             spans += [(first, middle), (middle, end)]
-    return np.array(sorted(kept), np.int64)
+    return np.array(sorted(keys), np.int64)
 
 
 @dataclass(frozen=True)
 class Moving:
     """The shapes that move something, on the vertices that count."""
 
-    places: npt.NDArray[np.int64]  # (K,) which of the set's shapes these are
+    indices: npt.NDArray[np.int64]  # (K,) numbers of the shapes in the set
     vertices: npt.NDArray[np.int64]  # (N,) vertices that count
     area: Array  # (N,) their shares of the area, which sum to one
     deltas: Array  # (K, 3N) displacements
@@ -384,7 +386,7 @@ class Moving:
 
 @dataclass(frozen=True)
 class Objective:
-    """What is minimised: ½ Σ xᵀ M x − Σ (P v)ᵀ x + ½ c Σ ‖x_t − x_{t−1}‖² in x, weights times `scale`."""
+    """The objective ½ Σ xᵀ M x − Σ (P v)ᵀ x + ½ c Σ ‖x_t − x_{t−1}‖² in x, weights times `scale`."""
 
     scale: Array  # (K,) root of each shape's energy: with it, M has ones on its diagonal
     projection: Array  # P (K, 3N), of the displacements v of the vertices that count
@@ -397,10 +399,10 @@ def objective(moving: Moving, shapes: ShapeSet, options: SolveOptions, frame_rat
     scale = np.sqrt(moving.energy)
     projection = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
     matrix = projection @ (moving.deltas / scale[:, None]).T + options.ridge * np.eye(len(scale))
-    for left, other in mirror_pairs(tuple(shapes.names[k] for k in moving.places)):
-        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[other] ** 2)
+    for left, right in mirror_pairs(tuple(shapes.names[k] for k in moving.indices)):
+        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[right] ** 2)
         row = np.zeros(len(scale))
-        row[left], row[other] = 1.0 / scale[left], -1.0 / scale[other]
+        row[left], row[right] = 1.0 / scale[left], -1.0 / scale[right]
         matrix += cost * np.outer(row, row)
     # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
     coupling = options.smoothness * (frame_rate / STATED_RATE) ** 2
@@ -409,30 +411,26 @@ def objective(moving: Moving, shapes: ShapeSet, options: SolveOptions, frame_rat
 
 def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> Moving:
     """The shapes of a set that move vertices which count."""
-    used = np.arange(len(animation.template))
+    vertices = np.arange(len(animation.template))
     if options.region is not None:
-        if not animation.regions:
-            raise OptionError.naming(f"{animation.name}: has no regions; give {{checkpoint}}, or omit the region")
-        if options.region not in animation.regions:
-            raise FaceDiffError(
-                f'{animation.name}: has no region "{options.region}"; {choices(options.region, animation.regions)}'
-            )
-        used = np.unique(np.asarray(animation.regions[options.region], np.int64))
-    area = np.ones(len(used))
+        check_factors({options.region: 1.0}, animation.regions, animation.name)
+        if options.region != ALL:
+            vertices = np.unique(np.asarray(animation.regions[options.region], np.int64))
+    area = np.ones(len(vertices))
     if options.area_weighted and animation.faces is not None and len(animation.faces):
-        whole = vertex_areas(animation.template, animation.faces)[used]
-        area = whole if whole.sum() > 0 else area
+        areas = vertex_areas(animation.template, animation.faces)[vertices]
+        area = areas if areas.sum() > 0 else area
     area = area / max(float(area.sum()), np.finfo(float).tiny)
-    deltas = shapes.deltas[:, used].reshape(len(shapes.names), -1).astype(np.float64)
+    deltas = shapes.deltas[:, vertices].reshape(len(shapes.names), -1).astype(np.float64)
     energy = np.square(deltas) @ np.repeat(area, 3)
     # A shape that moves nothing among the vertices that count has no energy to be scaled by.
     still = np.array([name in shapes.still for name in shapes.names])
-    places = np.flatnonzero(~still & (energy > 1e-12 * energy.max(initial=0.0)))
-    if not len(places):
+    indices = np.flatnonzero(~still & (energy > 1e-12 * energy.max(initial=0.0)))
+    if not len(indices):
         raise FaceDiffError(
             f"{animation.name}: no shape moves any vertex that counts; give other shapes or another region"
         )
-    return Moving(places, used, area, deltas[places], energy[places])
+    return Moving(indices, vertices, area, deltas[indices], energy[indices])
 
 
 def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
@@ -442,29 +440,25 @@ def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integ
 
 
 def _displacements(animation: Animation, moving: Moving) -> Iterator[tuple[slice, Array]]:
-    """Displacements (frames, N, 3) from the template, some frames at a time; refuses what is not finite."""
+    """Displacements (frames, N, 3) from the template, some frames at a time."""
     step = max(1, CHUNK_BYTES // (24 * len(animation.template)))
     for first in range(0, len(animation.vertices), step):
         chunk = np.asarray(animation.vertices[first : first + step], np.float64)
-        finite = np.isfinite(chunk).all(axis=(1, 2))
-        if not finite.all():
-            bad = first + int(np.argmin(finite))
-            raise FaceDiffError(f"{animation.name}: frame {bad} holds NaN or infinity; generate the motion again")
         moved = (chunk - np.asarray(animation.template, np.float64))[:, moving.vertices]
         yield slice(first, first + len(chunk)), moved
 
 
 def _residuals(animation: Animation, moving: Moving, values: Array) -> tuple[Array, Array]:
-    """Root mean square and maximum (T,) over the vertices of the distances that are left."""
-    rms, most = [], []
+    """Root mean square and maximum (T,) over the vertices of the residuals."""
+    rms, largest = [], []
     for frames, moved in _displacements(animation, moving):
         square = np.square(moved - (values[frames] @ moving.deltas).reshape(moved.shape)).sum(axis=-1)
         rms.append(np.sqrt(square.mean(axis=-1)))
-        most.append(np.sqrt(square.max(axis=-1)))
-    return np.concatenate(rms), np.concatenate(most)
+        largest.append(np.sqrt(square.max(axis=-1)))
+    return np.concatenate(rms), np.concatenate(largest)
 
 
-# Weights as CSV, with a JSON file next to the table for what a table cannot say.
+# Weights as CSV, with a JSON file of further facts next to the table.
 
 FORMAT = "facediff blendshape weights 1"
 SURELY_SIXTIETHS = 31 / 60  # A table with a row at this time is read as one of sixtieths
@@ -483,7 +477,7 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
 
     Args:
         path: the table.
-        weights: what is written.
+        weights: the weights.
         key_tolerance: as :meth:`Weights.save` takes it.
     """
     column = {name: index for index, name in enumerate(weights.names)}
@@ -493,35 +487,32 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
             f"table's columns; rename them, or write a table of their own names with {{plain}}"
         )
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]
-    held = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times
-    values, absent = live_link_values(weights)
-    values = np.concatenate([values, values[-1:]])[: len(held)]
-    rows = live_link_rows(
-        ParameterClip(path.stem, values, layout("live_link"), weights.frame_rate, np.array(held), layout="live_link")
-    )
+    row_times = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times
+    values, unknown = live_link_values(weights)
+    values = np.concatenate([values, values[-1:]])[: len(row_times)]
+    space, stamps = layout("live_link"), np.array(row_times)
+    rows = live_link_rows(ParameterClip(path.stem, values, space, weights.frame_rate, stamps, layout="live_link"))
     more: dict[str, object] = {
         "rotations": "radians, as Live Link Face records them: yaw and roll to the face's right and pitch down are "
         "positive; columns of rotations_absent are 0 and say nothing",
-        "rotations_absent": absent,
+        "rotations_absent": unknown,
         "timecode": "frames are sixtieths of a second with a fraction, whatever the frame rate",
-        "rows_held": len(held) - len(times),
+        "rows_held": len(row_times) - len(times),
     }
     _write_both(path, live_link_header(), rows, _about(weights, in_table=ARKIT, more=more, key_tolerance=key_tolerance))
 
 
 def live_link_values(weights: Weights) -> tuple[npt.NDArray[np.float32], list[str]]:
-    """Values (T, 61) in the layout ``live_link``, and which of ``head`` and ``eyes`` they know nothing about."""
+    """Values (T, 61) in the layout ``live_link``, and the names of unknown rotations, ``head`` and ``eyes``."""
     column = {name: index for index, name in enumerate(weights.names)}
     looks = [name for name in column if name.startswith("eyeLook") and name not in weights.still]
     zero = np.zeros(len(weights.values))
     shapes = [weights.values[:, column[name]] if name in column else zero for name in ARKIT]
     head = np.zeros((len(zero), 3)) if weights.head is None else convert(weights.head, "axis_angle", "euler")
     eyes = gaze(weights.names, weights.values) if weights.eyes is None else weights.eyes
-    absent = [
-        *(["head"] if weights.head is None else []),
-        *(["eyes"] if weights.eyes is None and not looks else []),
-    ]
-    return np.concatenate([np.stack(shapes, axis=1), head, eyes], axis=1).astype(np.float32), absent
+    unknown = ["head"] if weights.head is None else []
+    unknown += ["eyes"] if weights.eyes is None and not looks else []
+    return np.concatenate([np.stack(shapes, axis=1), head, eyes], axis=1).astype(np.float32), unknown
 
 
 def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:
@@ -529,7 +520,7 @@ def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> N
 
     Args:
         path: the table.
-        weights: what is written.
+        weights: the weights.
         key_tolerance: as :meth:`Weights.save` takes it.
     """
     header = ["time", *weights.names, "residual_rms_mm", "residual_max_mm"]
@@ -548,7 +539,7 @@ def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> N
 def _about(
     weights: Weights, *, in_table: Sequence[str], more: Mapping[str, object], key_tolerance: float
 ) -> dict[str, object]:
-    """What a table does not say."""
+    """The content of the .json next to a table."""
     if key_tolerance > 0:
         curves = {name: {"times": t, "values": v} for name, (t, v) in weights.curves(key_tolerance).items()}
         more = {**more, "key_tolerance": key_tolerance, "curves": curves}

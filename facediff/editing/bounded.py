@@ -1,4 +1,4 @@
-"""Least squares within bounds: quadratic programs whose variables have a least and a greatest value.
+"""Least squares within bounds: quadratic programs with a least and a greatest value of each variable.
 
 Three solvers: :func:`minimise` for all frames of a motion in one problem; :class:`Pivoting` for one frame after the
 other, each of which is nearly the last one; and :func:`least_squares` of a system itself, without squaring its
@@ -73,10 +73,10 @@ def minimise_sparse(
     Returns:
         x (T, K), and whether the residual of the second problem meets the tolerance (K,).
     """
-    chosen = minimise_sum(problem, cost, tolerance, max_iterations)
+    sparse = minimise_sum(problem, cost, tolerance, max_iterations)
     # A shape that is at work in a frame is free in those around it, or its curve would begin and end with a jump.
     window = np.lib.stride_tricks.sliding_window_view
-    reach = np.pad(np.abs(chosen) > ACTIVE * cost, ((frames_around, frames_around), (0, 0)))
+    reach = np.pad(np.abs(sparse) > ACTIVE * cost, ((frames_around, frames_around), (0, 0)))
     active = window(reach, 2 * frames_around + 1, axis=0).any(axis=-1)
     lower = np.where(active, problem.lower, np.clip(0.0, problem.lower, problem.upper))
     upper = np.where(active, problem.upper, np.clip(0.0, problem.lower, problem.upper))
@@ -87,7 +87,7 @@ def minimise_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations
     """The solution with Σ_t Σ_k cost_k |x_tk| added to the objective, (T, K)."""
     if (problem.lower >= 0).all():
         return minimise(replace(problem, right=problem.right - cost), tolerance, max_iterations)[0]
-    # Where weights have both signs, each is a positive part less a negative one, whose sum is its size.
+    # Where weights have both signs, each is a positive part less a negative one, and the sum of both is its size.
     parts = Problem(
         np.block([[problem.matrix, -problem.matrix], [-problem.matrix, problem.matrix]]),
         np.concatenate([problem.right - cost, -problem.right - cost], axis=1),
@@ -96,8 +96,8 @@ def minimise_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations
         np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
     )
     # The cost makes it pay to have one of both parts only; where rounding leaves some of both, the difference counts.
-    both_parts, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
-    positive, negative = np.split(both_parts, 2, axis=1)
+    solution, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
+    positive, negative = np.split(solution, 2, axis=1)
     return positive - negative
 
 
@@ -105,7 +105,7 @@ def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[A
     """The box's point of least value.
 
     Bertsekas, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 1982:
-    variables on a bound whose gradient pushes outwards follow the gradient, the others take Newton's step; both are
+    variables on a bound with a gradient outwards follow the gradient, the others take Newton's step; both are
     clipped to the box, and the step is shortened until the objective falls enough, which makes it converge from
     anywhere. The free variables of all frames are solved for together.
 
@@ -121,70 +121,70 @@ def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[A
         if (left <= tolerance).all():
             return x, True
         slope = problem.gradient(x)
-        # A set of held variables that changed with every step would keep the steps short: near a bound counts as on it.
+        # A set of bound variables that changed with every step would keep the steps short: near a bound counts as on
+        # it.
         # The distance that counts as near shrinks with the residual, so that the solution is not affected.
         near = min(NEAR * width, float(left.max()))
-        held = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
-        direction = np.where(held, -slope, _newton(problem, -slope, ~held))
-        following = _step(problem, x, slope, direction, held)
+        bound = ((x <= problem.lower + near) & (slope > 0)) | ((x >= problem.upper - near) & (slope < 0))
+        direction = np.where(bound, -slope, _newton(problem, -slope, ~bound))
+        following = _step(problem, x, slope, direction, bound)
         if following is None:
             break
         x = following
     return x, bool((problem.residual(x) <= tolerance).all())
 
 
-def _step(problem: Problem, x: Array, slope: Array, direction: Array, held: Mask) -> Array | None:
+def _step(problem: Problem, x: Array, slope: Array, direction: Array, bound: Mask) -> Array | None:
     """The longest sufficient step along the clipped direction; None where rounding lets the objective fall no more."""
     length = 1.0
-    promise = -float((slope * direction)[~held].sum())
+    promise = -float((slope * direction)[~bound].sum())
     while length > SHORTEST:
         following = problem.clip(x + length * direction)
         moved = following - x
         # Armijo's rule for projected steps: free variables promise a decrease by their slope along the direction,
-        # held ones by how far they really move, since the box may cut their way short.
-        promised_decrease = length * promise - float((slope * moved)[held].sum())
+        # bound ones by how far they really move, since the box may cut their way short.
+        promised_decrease = length * promise - float((slope * moved)[bound].sum())
         if problem.change(slope, moved) <= -SUFFICIENT * promised_decrease:
             return following if moved.any() else None
         length /= 2
     return None
 
 
-def _newton(problem: Problem, right: Array, free: Mask) -> Array:
-    """Solve for the free variables, the others being zero: (T, K)."""
+def _newton(problem: Problem, right: Array, inner: Mask) -> Array:
+    """Solve for the inner variables (those not on a bound), the others being zero: (T, K)."""
     frames, count = right.shape
     neighbours = np.full((frames, 1), 2.0)
     neighbours[0] -= 1
     neighbours[-1] -= 1
     # A base install lacks SciPy: the same system is solved as a chain of blocks, frame by frame.
     if not has_scipy():
-        both = free[:, :, None] & free[:, None]
-        blocks = np.where(both, problem.matrix, 0.0)
-        own = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
-        blocks[:, np.arange(count), np.arange(count)] = own
-        links = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
-        return np.where(free, solve_block_chain(blocks, links, np.where(free, right, 0.0)), 0.0)
+        blocks = np.where(inner[:, :, None] & inner[:, None], problem.matrix, 0.0)
+        diagonal = np.where(inner, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
+        blocks[:, np.arange(count), np.arange(count)] = diagonal
+        links = np.where(inner[1:] & inner[:-1], -problem.coupling, 0.0)
+        return np.where(inner, solve_block_chain(blocks, links, np.where(inner, right, 0.0)), 0.0)
     from scipy.linalg import solveh_banded
 
     # M + c · (number of neighbours) on the block diagonal and −c next to it make a band of K below the diagonal, stored
     # as LAPACK expects it: the last axis counts how far below. The lower form is some twenty times faster than the
-    # upper one, whose small products OpenBLAS spreads over threads. A variable that is held gets a row of the identity.
+    # upper one: OpenBLAS spreads its small products over threads. A variable on a bound gets a row of the identity.
     rows = max(count, 2) + 1  # scipy fails on a single variable with a narrower band
     band = np.zeros((frames, count, rows))
-    band[:, :, 0] = np.where(free, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
+    band[:, :, 0] = np.where(inner, np.diagonal(problem.matrix) + problem.coupling * neighbours + JITTER, 1.0)
     for d in range(1, count):
-        band[:, :-d, d] = np.where(free[:, d:] & free[:, :-d], np.diagonal(problem.matrix, d), 0.0)
-    band[:-1, :, count] = np.where(free[1:] & free[:-1], -problem.coupling, 0.0)
-    goal = np.where(free, right, 0.0).ravel()
+        band[:, :-d, d] = np.where(inner[:, d:] & inner[:, :-d], np.diagonal(problem.matrix, d), 0.0)
+    band[:-1, :, count] = np.where(inner[1:] & inner[:-1], -problem.coupling, 0.0)
+    goal = np.where(inner, right, 0.0).ravel()
     solved = solveh_banded(band.reshape(-1, rows).T, goal, overwrite_ab=True, lower=True, check_finite=False)
-    return np.where(free, solved.reshape(frames, count), 0.0)
+    return np.where(inner, solved.reshape(frames, count), 0.0)
 
 
-# One frame at a time. Which variables lie on a bound changes little from frame to frame. Once that is known, what is
-# left is a linear system, whose inverse is kept for the next frame with the same free variables.
+# One frame at a time. The variables on a bound change little from frame to frame. The others solve a linear system; its
+# inverse is kept for the next frame with the same inner variables.
 
 MISSED = 1e-10  # How far a variable may lie beyond its bound, or a slope on the wrong side of zero: rounding
 PATIENCE = 3  # Exchanges of all wrong variables that may fail to make them fewer
-KEPT = 64  # Inverses
+MOST_INVERSES = 64
 ROUNDING = 1e-14  # Share of its terms' sum below which a slope of a system is zero
 
 
@@ -192,8 +192,8 @@ class Pivoting:
     """Minimises ½ xᵀ M x − rᵀ x within lower ≤ x ≤ upper for many r (K,), quickly where they differ little.
 
     Júdice & Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity
-    problems", Computers & Operations Research 1994, for variables with two bounds: each is free or on one of its
-    bounds; those that break a condition change sides all together, and one at a time where that does not make them
+    problems", Computers & Operations Research 1994, for variables with two bounds: each lies between them or on one;
+    those that break a condition change sides all together, and one at a time where that does not make them
     fewer. It begins with the sides of the last solution. Should it not end, :func:`minimise` solves the frame.
 
     Args:
@@ -215,7 +215,7 @@ class Pivoting:
         self._side = np.zeros(len(matrix), np.int8)  # -1 on the lower bound, 1 on the upper one, 0 between them
 
     def solve(self, right: Array, lower: Array, upper: Array) -> Array:
-        """The point (K,) of least value; a variable whose bounds are equal stays there.
+        """The point (K,) of least value; a variable with equal bounds stays there.
 
         Args:
             right: r (K,).
@@ -246,27 +246,26 @@ class Pivoting:
         return self._carefully(right, lower, upper)
 
     def _at(self, side: npt.NDArray[np.int8], right: Array, lower: Array, upper: Array) -> Array:
-        """The variables, those on a bound there and the free ones where their slope is zero."""
+        """The variables on a bound there, and the others where their slope is zero."""
         x = np.where(side < 0, lower, upper)
-        free = side == 0
-        if not free.any():
+        inner = side == 0
+        if not inner.any():
             return x
-        # What the bound variables contribute moves to the right-hand side; a system of the free ones is left.
-        x[free] = 0.0
-        goal = (right - self.matrix @ x)[free]
-        key = free.tobytes()
+        # The bound variables' terms move to the right-hand side; a system of the inner ones is left.
+        x[inner] = 0.0
+        goal = (right - self.matrix @ x)[inner]
+        key = inner.tobytes()
         inverse = self._inverses.get(key)
-        block = self._solvable[np.ix_(free, free)]
+        block = self._solvable[np.ix_(inner, inner)]
         if inverse is None:
-            # Frame after frame the same few sets of variables are free, so that an inverse pays where a solve would
-            # not.
+            # The same few sets of inner variables return frame after frame, so that an inverse pays.
             inverse = self._inverses[key] = np.asarray(np.linalg.inv(block), np.float64)
-            if len(self._inverses) > KEPT:
+            if len(self._inverses) > MOST_INVERSES:
                 self._inverses.popitem(last=False)
         else:
             self._inverses.move_to_end(key)
         solution = inverse @ goal
-        x[free] = solution + inverse @ (goal - block @ solution)  # once more for what rounding left
+        x[inner] = solution + inverse @ (goal - block @ solution)  # once more against rounding
         return x
 
     def _carefully(self, right: Array, lower: Array, upper: Array) -> Array:
@@ -284,8 +283,8 @@ def least_squares(matrix: Array, right: Array, lower: Array, upper: Array, start
     """The point of a box at which |A x − b|² is least, where A has full rank.
 
     Stark & Parker, "Bounded-variable least-squares: an algorithm and applications", Computational Statistics 1995:
-    variables are free or on a bound; the free ones are solved for, go only as far as the box allows, and of the others
-    the one whose slope leads into the box most steeply becomes free, until there is none.
+    the variables between their bounds are solved for and go only as far as the box allows; of the variables on a bound,
+    the one with the steepest slope into the box is released, until there is none.
 
     Args:
         matrix: A (M, K).
@@ -303,13 +302,13 @@ def least_squares(matrix: Array, right: Array, lower: Array, upper: Array, start
     side = np.where(x <= lower, -1, np.where(x >= upper, 1, 0))
     x = np.where(side < 0, lower, np.where(side > 0, upper, x))
     scale = np.abs(matrix).T @ np.abs(right) + np.abs(matrix.T @ matrix) @ np.maximum(np.abs(lower), np.abs(upper))
-    refused: set[int] = set()  # freed, and pushed back by rounding: not to be freed again before something else moves
+    refused: set[int] = set()  # released, and pushed back by rounding: stays until something else moves
     for _ in range(20 * count):
-        while (free := side == 0).any():
-            goal = right - matrix[:, ~free] @ x[~free]
+        while (inner := side == 0).any():
+            goal = right - matrix[:, ~inner] @ x[~inner]
             target = x.copy()
-            target[free] = np.linalg.lstsq(matrix[:, free], goal)[0]
-            beyond = free & ((target < lower) | (target > upper))
+            target[inner] = np.linalg.lstsq(matrix[:, inner], goal)[0]
+            beyond = inner & ((target < lower) | (target > upper))
             if not beyond.any():
                 x = target
                 break
@@ -318,24 +317,24 @@ def least_squares(matrix: Array, right: Array, lower: Array, upper: Array, start
             shares = np.full(count, np.inf)
             shares[beyond] = (bound - x)[beyond] / (target - x)[beyond]
             first = int(shares.argmin())
-            x = np.where(free, x + min(1.0, max(0.0, float(shares[first]))) * (target - x), x)
+            x = np.where(inner, x + min(1.0, max(0.0, float(shares[first]))) * (target - x), x)
             x[first], side[first] = bound[first], -1 if bound[first] == lower[first] else 1
             x = np.clip(x, lower, upper)
         slope = matrix.T @ (right - matrix @ x)
         inwards = np.where(side < 0, slope, np.where(side > 0, -slope, 0.0)) / np.maximum(scale, 1e-300)
         inwards[upper <= lower] = 0.0
         inwards[list(refused)] = 0.0
-        chosen = int(inwards.argmax())
-        if inwards[chosen] <= ROUNDING:
+        released = int(inwards.argmax())
+        if inwards[released] <= ROUNDING:
             break
-        before = side[chosen]
-        side[chosen] = 0
-        free = side == 0
-        goal = right - matrix[:, ~free] @ x[~free]
-        moved = np.linalg.lstsq(matrix[:, free], goal)[0][int(free[:chosen].sum())] - x[chosen]
+        before = side[released]
+        side[released] = 0
+        inner = side == 0
+        goal = right - matrix[:, ~inner] @ x[~inner]
+        moved = np.linalg.lstsq(matrix[:, inner], goal)[0][int(inner[:released].sum())] - x[released]
         if moved * before >= 0:  # it would leave the box at once: its slope is nothing but rounding
-            side[chosen] = before
-            refused.add(chosen)
+            side[released] = before
+            refused.add(released)
         else:
             refused.clear()
     return x

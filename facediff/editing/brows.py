@@ -1,4 +1,4 @@
-"""Where a face's brows are, and how they rise: known for the built-in puppet, found or given for any other face."""
+"""Brows of a face and their rise: known for the built-in puppet, carried over or given for any other face."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from facediff.editing.procedural import copied
 from facediff.errors import OptionError
 
 REGION = "brows"
-"""A region of this name says where the brows are."""
+"""Name of the region with the vertices of the brows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,11 @@ def brows_of(
 ) -> Brows:
     """The brows of a face (V, 3).
 
-    They are those that ``eyes`` or a region "brows" names, where there are; else those of the built-in face, which are
-    carried over to other faces.
+    ``eyes`` or a region "brows" lists their vertices; without either, the brows of the built-in face are carried over.
     """
-    named = eyes.brows if eyes is not None and eyes.brows is not None else regions.get(REGION)
-    if named is not None and len(named):
-        weights = region_factors(template, {REGION: named}, {REGION: 1.0, ALL: 0.0})
+    vertices = eyes.brows if eyes is not None and eyes.brows is not None else regions.get(REGION)
+    if vertices is not None and len(vertices):
+        weights = region_factors(template, {REGION: vertices}, {REGION: 1.0, ALL: 0.0})
         up = weights[:, None] * np.array([0.0, 1.0, 0.0])
         return Brows(_one_millimetre(up, unit), _one_millimetre(-up, unit))
     from facediff.synthetic.known_faces import built_in_shapes, known_face
@@ -63,13 +62,12 @@ def brows_of(
         neutral, triangles, _ = built_in_shapes("F1")
         lender = known_face(neutral, triangles)
         assert lender is not None  # noqa: S101 - for type checkers
-        moved = carried(neutral, triangles, np.stack([lender.brows_up, lender.brows_down]), template, faces)
-        if moved is None:
+        fields = carried(neutral, triangles, np.stack([lender.brows_up, lender.brows_down]), template, faces)
+        if fields is None or not np.abs(fields).max(axis=(1, 2)).all():
             raise OptionError.naming(
-                'brows: where they are is not known for this face; list their vertices as "brows" in the file of '
-                "{eyes}, or give a mesh with triangles whose mouth can open"
+                'brows: they are not known for this face; list their vertices as "brows" in the file of {eyes}, or '
+                "give a mesh with triangles and an open line between the lips"
             )
-        fields = moved
     else:
         fields = np.stack([puppet.brows_up, puppet.brows_down])
     return Brows(*(_one_millimetre(field, unit) for field in fields))
@@ -85,7 +83,7 @@ def carried(
     """Displacements (K, V, 3) of a built-in face on another one, in its unit; None if no face is found in it."""
     from facediff.editing.correspondence import correspond
     from facediff.editing.face_features import find_features
-    from facediff.editing.retargeting import carry_displacements
+    from facediff.editing.retargeting import transfer_displacements
 
     if faces is not None and len(faces):
         correspondence = correspond(neutral, triangles, template, faces)
@@ -96,7 +94,7 @@ def carried(
             find_features(correspondence.source_vertices, correspondence.source_faces),
         )
         if features is not None and not correspondence.fits_badly:
-            return carry_displacements(correspondence, fields)
+            return transfer_displacements(correspondence, fields)
     return None
 
 
@@ -104,10 +102,6 @@ def _one_millimetre(field: npt.ArrayLike, unit: str) -> npt.NDArray[np.float32]:
     """Displacements (V, 3) scaled so that the largest is one millimetre."""
     displacements = np.asarray(field, np.float64)
     largest = float(np.linalg.norm(displacements, axis=-1).max(initial=0.0))
-    if largest <= 0:
-        raise OptionError.naming(
-            "brows: no vertex of this face moves with them; list their vertices in the file of {eyes}"
-        )
     return np.asarray(displacements * (0.001 / metres_per_unit(unit) / largest), np.float32)
 
 

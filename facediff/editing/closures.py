@@ -1,4 +1,4 @@
-"""Lips that meet where speech has them meet: at p, b and m, whose times come from an alignment."""
+"""Lips that meet at p, b and m, at the times of an alignment."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from facediff.animation import Animation
 from facediff.animation.animation import metres_per_unit
 from facediff.editing.expressiveness import ALL, region_factors
 from facediff.editing.eyes import Array
-from facediff.editing.procedural import EDITED, copied, noted
+from facediff.editing.procedural import EDITED, copied, with_metadata
 from facediff.errors import FaceDiffError
 from facediff.utils.numerics import smooth_step
 
@@ -18,24 +18,24 @@ RAMP = 0.08
 """Seconds in which lips come together, and part again."""
 
 BUDGET = 12.0
-"""Millimetres that a vertex is moved by at most, unless somebody says otherwise."""
+"""Largest displacement of a vertex in millimetres, by default."""
 
 LEAST = 1e-4
-"""Opening in metres whose changes are too small to learn from how the face opens its mouth."""
+"""Opening in metres below which the animation does not show how the face opens its mouth."""
 
 
 def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], budget: float = BUDGET) -> Animation:
     """Let the lips touch in stretches of time, smoothly, by moving no vertex further than a budget.
 
     How this face opens its mouth is taken from the animation itself: each vertex's motion is regressed on the signed
-    opening, the mean distance of the inner-lip pairs along the direction in which they part. At a closure, as much of
-    that is taken back as the opening exceeds the neutral face's; what does not open the mouth, such as rounding, stays.
-    Frames without a closure nearby are bit for bit what they were, and so are those in which the lips meet already.
+    opening, the mean distance of the inner-lip pairs along the direction in which they part. At a closure, the excess
+    of the opening over the neutral face's is taken back; motion that does not open the mouth, such as rounding, stays.
+    Frames without a closure nearby, and frames in which the lips meet already, are unchanged bit for bit.
 
     Args:
         animation: with inner-lip pairs.
         closures: start and end of each, in seconds.
-        budget: millimetres; a closure that would need more stays open by what is missing.
+        budget: millimetres; a closure that would need more stays open by the rest.
     """
     if animation.inner_lip_pairs is None or not len(animation.inner_lip_pairs):
         raise FaceDiffError(
@@ -49,7 +49,7 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     still = rest[upper] - rest[lower]
     gaps = np.asarray(animation.vertices[:, upper], np.float64) - animation.vertices[:, lower] - still
     apart = np.linalg.norm(gaps, axis=-1).mean(1)
-    # The direction in which lips part is that of the widest fifth of the frames: at rest, gaps have none.
+    # The widest fifth of the frames gives the direction in which lips part: at rest, gaps have none.
     widest = gaps[apart >= np.quantile(apart, 0.8)].mean(0)
     if apart.max(initial=0) < LEAST * metre or not bumps.any():
         return animation
@@ -59,15 +59,15 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     # Moving by the shape changes the opening by about 1; exactly by this much.
     per_unit = float(((shape[upper] - shape[lower]) * direction).sum(-1).mean())
     if per_unit < 0.2:
-        return animation  # nothing that moves with the opening closes it: this face does not open its mouth
+        return animation  # this face does not open its mouth
     # Lips pressed together more firmly than at rest are left as they are.
     excess = np.maximum(opening, 0) / per_unit
     reach = float(np.linalg.norm(shape, axis=-1).max()) or 1.0
     amounts = np.zeros(len(excess))
     for bump in bumps:
         amount = bump * excess
-        most = amount.max(initial=0) * reach
-        amounts = np.maximum(amounts, amount * min(1.0, budget / 1000 * metre / most) if most else 0)
+        largest = amount.max(initial=0) * reach
+        amounts = np.maximum(amounts, amount * min(1.0, budget / 1000 * metre / largest) if largest else 0)
     changed = np.flatnonzero(amounts)
     if not len(changed):
         return animation
@@ -77,7 +77,7 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
         vertices[frame] -= (amounts[frame] * shape).astype(np.float32)
         moved = max(moved, amounts[frame] * reach)
     note = f"lips closed at {len(bumps)} p, b, m (moved by up to {1000 * moved / metre:.1f} mm)"
-    return noted(animation, vertices, EDITED, note)
+    return with_metadata(animation, vertices, EDITED, note)
 
 
 def closure_weights(closures: Sequence[tuple[float, float]], frames: int, frame_rate: float) -> Array:

@@ -1,8 +1,8 @@
-"""Animation controls on one face: what they need to know of it is found once, for all of its animations.
+"""Animation controls on one face: eyes, brows and shapes are found once, for all of its animations.
 
 From top to bottom: the amounts of all controls in each frame, from options, keys and acting together
 (:class:`Amounts`); :class:`ControlledFace`, which applies them to whole animations or to a stretch of one; and
-:func:`apply_controls`, which does all of that for a finished animation.
+:func:`apply_controls` for a finished animation.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from facediff.editing.controls import keys_of, refuse_folder
 from facediff.editing.direction import METADATA, Direction, channel_of, curve, direction_of
 from facediff.editing.expressiveness import expressiveness_words, scaled_regions
 from facediff.editing.eyes import GIVE, Array, Eyes, eyes_for
-from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, noted
+from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, with_metadata
 from facediff.errors import FaceDiffError, OptionError
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 HEAD = ("head.pitch", "head.yaw", "head.roll")
 ACTED = ("brows", "lids", *HEAD)
-"""What acting moves, in the order of its columns."""
+"""Channels of acting, in the order of its columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +70,16 @@ class Amounts:
 
 
 class ControlledFace:
-    """One face whose animations are controlled.
+    """One face with its controls.
 
     Args:
-        controls: what is changed.
+        controls: the options.
         direction: keys over time of the controls, with frames turned into seconds; None for none.
         template: the neutral face (V, 3).
         faces: triangles (F, 3).
         regions: vertex indices by name.
         unit: of length.
-        name: what errors call it.
+        name: for errors.
     """
 
     def __init__(
@@ -134,29 +134,22 @@ class ControlledFace:
         if asking is None and not helped:
             return None
         eyes = eyes_for(template, faces, None if controls.eyes is None else Path(controls.eyes))
-        if asking is None:
-            return eyes
-        if eyes is None:
-            raise OptionError.naming(
-                f"{asking}: needs to know where lids and eyeballs are, which is known for the built-in puppet only; "
-                f"{GIVE}"
+        if asking is not None and (eyes is None or (balls is not None and not eyes.eyeballs)):
+            lacking = (
+                "lids and eyeballs of this face are not known" if eyes is None else f"{eyes.source} has no eyeballs"
             )
-        if lids is not None:
+            raise OptionError.naming(f"{asking if eyes is None else balls}: {lacking}; {GIVE}")
+        if lids is not None and eyes is not None:
             eyes.lids()
-        if balls is not None and not eyes.eyeballs:
-            raise OptionError.naming(f"{balls}: {eyes.source} does not say which vertices are the eyeballs; add them")
         return eyes
 
     def refuse_whole_animation(self) -> None:
-        """Refuse, for a stream, what depends on where the animation ends."""
+        """Refuse, for a stream, controls that depend on the end of the animation."""
         for name in ("blinks", "gaze", "sway"):
-            if getattr(self.controls, name) is not None:
+            source = "" if self.direction is None else f"{self.direction.source}: channel {name}"
+            if control := f"--{name}" if getattr(self.controls, name) is not None else self._keys(name) and source:
                 raise FaceDiffError(
-                    f"--{name}: needs the whole animation; give --acting, which needs none, or animate a recording"
-                )
-            if self._keys(name) and self.direction is not None:
-                raise FaceDiffError(
-                    f"{self.direction.source}: channel {name}: needs the whole animation; animate a recording"
+                    f"{control}: needs the whole animation; animate a recording, or give --acting, which needs none"
                 )
 
     def amounts(
@@ -226,7 +219,7 @@ class ControlledFace:
     def apply(self, animation: Animation, amounts: Amounts) -> Animation:
         """An animation, or a stretch of one, with everything changed that is asked for.
 
-        Expressiveness comes first, then shapes, brows, gaze and lids, and last the head, which takes everything along.
+        The order is expressiveness, shapes, brows, gaze, lids, and last the head, which takes everything along.
 
         Args:
             animation: of the face, with frames as the model made them.
@@ -260,11 +253,11 @@ class ControlledFace:
         if amounts.turns is not None and amounts.shifts is not None:
             animation = procedural.move_head(animation, amounts.turns, amounts.shifts)
         for key, note in amounts.notes:
-            animation = noted(animation, animation.vertices, key, note)
+            animation = with_metadata(animation, animation.vertices, key, note)
         return self._with_direction(animation)
 
     def _with_direction(self, animation: Animation) -> Animation:
-        """The direction in the metadata, next to what the animation was made with; that a model follows is there."""
+        """The animation with the direction in its metadata, next to the keys that it was generated with."""
         if self.direction is None:
             return animation
         name, direction = METADATA, self.direction
@@ -287,7 +280,7 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
 
     Args:
         animation: with frames as the model made them.
-        controls: what is changed.
+        controls: the options.
         seed: of blinks, gaze, sway and acting, unless the controls have their own.
     """
     if controls.is_off:
@@ -297,17 +290,15 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
     if direction is not None:
         direction.refuse_model_channels()
         before = direction_of(animation)
-        if before is not None and set(direction.keys) <= set(before.keys):
-            raise FaceDiffError(
-                f"{direction.source}: {animation.name} has these keys already; give the animation as it was before"
-            )
+        repeated = ["these keys"] if before is not None and set(direction.keys) <= set(before.keys) else []
         for option in direction.instead_of:
-            turned = before is not None and option in before.instead_of
-            if turned or f"{option} (" in animation.metadata.get(PROCEDURAL, ""):
-                raise FaceDiffError(
-                    f"{direction.source}: instead_of: the keys do what --{option} did, and {animation.name} has that "
-                    f"already; give the animation as it was before"
-                )
+            replaced = before is not None and option in before.instead_of
+            if replaced or f"{option} (" in animation.metadata.get(PROCEDURAL, ""):
+                repeated.append(f"the motion of --{option}, which the keys replace (instead_of),")
+        if repeated:
+            raise FaceDiffError(
+                f"{direction.source}: {animation.name} has {repeated[0]} already; give the animation as it was before"
+            )
     gestures = None
     if controls.acting is not None:
         from facediff.editing.acting import act, read_acting

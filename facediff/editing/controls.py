@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 UNCHECKED = FRAME_RATES[1]
-"""Frame rate by which frames and timecodes of keys are read before that of the animation is known: any may be right."""
+"""Frame rate for reading frames and timecodes of keys before the animation's own is known."""
 
 
 def check_controls(controls: AnimationControls) -> None:
@@ -24,24 +24,18 @@ def check_controls(controls: AnimationControls) -> None:
         from facediff.editing.expressiveness import read_factors
 
         read_factors(controls.expressiveness)
-    if (file := keys_file(controls.direction)) is not None and not file.exists():
-        from facediff.editing.direction import MOODS
-
-        raise OptionError(
-            "direction", f"no such file; expected keys over time, .json or .csv, or {', '.join(MOODS)}", file
-        )
-    if controls.eyes is not None and not Path(controls.eyes).is_file():
-        raise OptionError(
-            "eyes", "no such file; expected .json or .npz (see docs/animation_controls.md)", controls.eyes
-        )
-    if controls.controls_seed is not None and not is_procedural(controls):
-        raise OptionError(
-            "controls_seed", "has no effect without {blinks}, {gaze}, {sway} or {acting}; give one of them, or omit it"
-        )
-    if controls.eyes is not None and controls.is_off:
-        raise OptionError(
-            "eyes", "has no effect without {expressiveness}, {blinks}, {gaze} or {acting}; give one of them, or omit it"
-        )
+    for option, path, expected in (
+        ("direction", keys_file(controls.direction), "keys over time, .json or .csv, or a mood such as calm"),
+        ("eyes", controls.eyes, ".json or .npz (see docs/animation_controls.md)"),
+    ):
+        if path is not None and not Path(path).exists():
+            raise OptionError(option, f"no such file; expected {expected}", path)
+    for option, idle, users in (
+        ("controls_seed", not is_procedural(controls), "{blinks}, {gaze}, {sway} or {acting}"),
+        ("eyes", controls.is_off, "{expressiveness}, {blinks}, {gaze} or {acting}"),
+    ):
+        if getattr(controls, option) is not None and idle:
+            raise OptionError(option, f"has no effect without {users}; give one of them, or omit it")
     if (keys := keys_of(controls.direction)) is not None:
         for name in ("expressiveness", "blinks", "gaze", "sway", *keys.instead_of):
             if getattr(controls, name) is not None:

@@ -1,7 +1,7 @@
-"""Where each vertex of one face mesh lies on another one, whatever its topology, unit and axes.
+"""Correspondence of two face meshes of different topology, unit and axes.
 
-The steps stand in the order in which :func:`correspond` takes them: a similarity, partners of separate pieces, bending
-the target onto the source, and nearest points of a surface, which all of them need.
+The steps stand in the order of :func:`correspond`: a similarity, pairs of separate pieces, bending the target onto the
+source, and nearest points of a surface, which all of them need.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from facediff.editing.detached_parts import detached_parts, lash_pieces
 from facediff.editing.face_features import OPPOSITE, Features, find_features
 from facediff.editing.landmarks import Landmarks
 from facediff.editing.lids import EyeLids, eye_lids
-from facediff.editing.loose_pieces import lash_pieces, loose_pieces
 from facediff.editing.placing import place, place_face
 from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError
@@ -68,7 +68,7 @@ class Correspondence:
 
     @cached_property
     def features(self) -> tuple[Features | None, Features | None]:
-        """What the source shows of a face, and what the target shows in the source's place."""
+        """Features of the source, and of the target in the source's place."""
         source = find_features(self.source_vertices, self.source_faces)
         return source, None if source is None else find_features(self.laid.vertices, self.laid.faces, source)
 
@@ -79,8 +79,8 @@ class Correspondence:
         if self.lids == LIDS_AS_ALL or source is None or target is None:
             return None
         laid = Surface(self.laid.vertices, self.target_faces)
-        own = Surface(self.source_vertices, self.source_faces)
-        return eye_lids(own, laid, (source, target), at_rest=self.lids == LIDS_AT_REST)
+        source_surface = Surface(self.source_vertices, self.source_faces)
+        return eye_lids(source_surface, laid, (source, target), at_rest=self.lids == LIDS_AT_REST)
 
     @property
     def fits_badly(self) -> bool:
@@ -96,7 +96,7 @@ def correspond(
     target_faces: npt.NDArray[np.integer],
     *,
     landmarks: Landmarks | npt.NDArray[np.integer] | None = None,
-    shown: npt.NDArray[np.integer] | None = None,
+    face_triangles: npt.NDArray[np.integer] | None = None,
 ) -> Correspondence:
     """Find the place on a source mesh of every vertex of a target mesh.
 
@@ -110,10 +110,10 @@ def correspond(
         source_faces: (Fs, 3).
         target_vertices: (Vt, 3) neutral face that shall move.
         target_faces: (Ft, 3).
-        landmarks: pairs of places that are the same, or (L, 2) pairs of a source and a target vertex; three or more
-            also begin the alignment, for meshes that show other parts of the head.
-        shown: numbers of the target's triangles that the face is searched for in; all if None. Teeth and a tongue among
-            the others follow the jaw, and the rest of them stands still.
+        landmarks: pairs of equal points, or (L, 2) pairs of a source and a target vertex; three or more also begin the
+            alignment, for meshes that show other parts of the head.
+        face_triangles: numbers of the target's triangles in which to search for the face; all if None. Teeth and a
+            tongue among the others follow the jaw, and the rest of them stands still.
 
     Example:
         >>> vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3.0]])
@@ -129,21 +129,25 @@ def correspond(
     if source.vertices.shape == target.vertices.shape and np.array_equal(source.faces, target.faces):
         return _vertex_by_vertex(source, target)
     target = run_alike(source, target)
-    face = target if shown is None else Surface(target.vertices, target.faces[np.asarray(shown, np.int64)])
-    back, features, seen = placed(source, face, marks)
-    both = bending = None if features is None or seen is None else (features, seen)
+    face = (
+        target
+        if face_triangles is None
+        else Surface(target.vertices, target.faces[np.asarray(face_triangles, np.int64)])
+    )
+    back, features, target_features = placed(source, face, marks)
+    feature_pair = bending = None if features is None or target_features is None else (features, target_features)
     laid = Surface(back.apply(target.vertices), target.faces)
     if bending is not None and _one_surface(source, Surface(laid.vertices, face.faces)):
         bending = None  # what lies on the other mesh already need not be bent, and is exact to rounding
-    places = partners(source, laid, bending)
-    bent = _bent(source, laid, places, marks, bending)
-    nearest_points = places.nearest(bent.vertices, bent.normals)
+    pairs = part_pairs(source, laid, bending)
+    bent = _bent(source, laid, pairs, marks, bending)
+    nearest_points = pairs.nearest(bent.vertices, bent.normals)
     # Bending decides which place belongs to a vertex. The distance of the meshes is measured before bending, and the
     # trust in a place by the distance that is left after it.
     away = np.linalg.norm(laid.vertices - nearest_points.points, axis=1) / source.size
     left = nearest_points.distances / source.size
-    # Thin parts such as lips have a sheet on either side. A place on one whose normal is turned by more than 107
-    # degrees (a cosine of -0.3) is not trusted at all, one that is turned by less than 73 degrees fully.
+    # Thin parts such as lips have a sheet on either side. A point with a normal turned by more than 107 degrees (a
+    # cosine of -0.3) is not trusted at all, with less than 73 degrees fully.
     trust = np.clip((FAR - left) / (FAR - EXACT), 0.0, 1.0) * np.clip((nearest_points.cosines + 0.3) / 0.6, 0.0, 1.0)
     share = np.clip((FAR - left) / (FAR - CLOSE), 0.0, 1.0)
     corners, weights = nearest_points.corners, nearest_points.weights
@@ -152,15 +156,19 @@ def correspond(
         sided = (bending[1].codes > 0) & (left < FAR)
         trust[sided] = np.maximum(trust[sided], 1.0 - left[sided] / FAR)
     followers = (np.zeros(0, np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3)))
-    if both is not None:
-        loose = loose_pieces(source, laid, *both, places.alone)
-        corners[loose.jaw], weights[loose.jaw], share[loose.jaw] = loose.place.corners[0], loose.place.weights[0], 1.0
-        share[loose.still] = 0.0
-        trust[loose.jaw] = trust[loose.still] = 1.0
-        followers = loose.followers, loose.follower_corners, loose.follower_weights
-    elif shown is not None:
-        others = np.setdiff1d(np.arange(len(target.vertices)), face.faces)
-        share[others], trust[others] = 0.0, 1.0
+    if feature_pair is not None:
+        detached = detached_parts(source, laid, *feature_pair, pairs.unpaired)
+        corners[detached.jaw], weights[detached.jaw], share[detached.jaw] = (
+            detached.jaw_point.corners[0],
+            detached.jaw_point.weights[0],
+            1.0,
+        )
+        share[detached.still] = 0.0
+        trust[detached.jaw] = trust[detached.still] = 1.0
+        followers = detached.followers, detached.follower_corners, detached.follower_weights
+    elif face_triangles is not None:
+        unsearched = np.setdiff1d(np.arange(len(target.vertices)), face.faces)
+        share[unsearched], trust[unsearched] = 0.0, 1.0
     return Correspondence(
         corners=corners,
         weights=weights,
@@ -172,7 +180,9 @@ def correspond(
         source_faces=source.faces,
         target_vertices=target.vertices,
         target_faces=np.ascontiguousarray(target_faces, np.int64),
-        hidden=np.zeros(0, np.int64) if shown is None else np.setdiff1d(np.arange(len(target.faces)), shown),
+        hidden=np.zeros(0, np.int64)
+        if face_triangles is None
+        else np.setdiff1d(np.arange(len(target.faces)), face_triangles),
         followers=followers[0],
         follower_corners=followers[1],
         follower_weights=followers[2],
@@ -183,7 +193,7 @@ def correspond(
 def placed(
     source: Surface, target: Surface, marks: Landmarks | None = None
 ) -> tuple[Similarity, Features | None, Features | None]:
-    """The similarity that lays a target onto a source, and what is seen of the source and there of the target.
+    """The similarity that lays a target onto a source, and the features of the source and of the target there.
 
     Args:
         source: the animation's mesh at rest, y up and z to the viewer.
@@ -196,8 +206,8 @@ def placed(
     features = find_features(source.vertices, source.faces)
     if features is None:
         return place(target, source, start), None, None
-    back, seen = place_face(target, source, features, start)
-    return back, features, seen
+    back, target_features = place_face(target, source, features, start)
+    return back, features, target_features
 
 
 def _checked(name: str, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Surface:
@@ -217,10 +227,10 @@ SAME = 1e-4  # Half of the vertices nearer than this share of the face's size ma
 
 def _one_surface(source: Surface, laid: Surface) -> bool:
     """Whether two meshes that are aligned are cuts of one surface into other triangles."""
-    used = np.unique(laid.faces)
-    some = used if len(used) <= 500 else np.random.default_rng(0).choice(used, 500, replace=False)
-    there = nearest(source, laid.vertices[some], laid.normals[some], 0.0)
-    return bool(np.median(there.distances) < SAME * source.size)
+    vertices = np.unique(laid.faces)
+    some = vertices if len(vertices) <= 500 else np.random.default_rng(0).choice(vertices, 500, replace=False)
+    points_nearby = nearest(source, laid.vertices[some], laid.normals[some], 0.0)
+    return bool(np.median(points_nearby.distances) < SAME * source.size)
 
 
 def run_alike(source: Surface, target: Surface) -> Surface:
@@ -280,9 +290,9 @@ def refuse_other_mesh(
     if np.array_equal(faces, expected_faces):
         return
     extent = float(np.ptp(expected_vertices, axis=0).max())
-    # Rows in an order that does not depend on that of the vertices, rounding aside.
-    both = (np.asarray(points, np.float64) for points in (vertices, expected_vertices))
-    first, second = (rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)] for rows in both)
+    # Rows sorted by position, rounding aside, so that the order of the vertices does not matter.
+    meshes = (np.asarray(points, np.float64) for points in (vertices, expected_vertices))
+    first, second = (rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)] for rows in meshes)
     reordered = np.abs(first - second).max() <= 2 * ROUNDED * extent
     reason = "its vertices were reordered, as exporters do" if reordered else "it is another mesh"
     raise FaceDiffError(
@@ -292,13 +302,13 @@ def refuse_other_mesh(
 
 
 OTHER_FACE = 1e-3
-"""Half of another face's vertices lie further off than this share of its extent; those of a sculpted nose are fewer."""
+"""Half of another face's vertices lie further off than this share of its extent; a sculpted nose moves fewer."""
 
 
 def refuse_other_face(
     name: str, vertices: npt.NDArray[np.floating], expected_vertices: npt.NDArray[np.floating]
 ) -> None:
-    """Require the rest positions that a correspondence was made for, but for what was sculpted since."""
+    """Require the rest positions of a correspondence, except for sculpted details."""
     away = float(np.median(np.linalg.norm(vertices - expected_vertices, axis=1)))
     if away > OTHER_FACE * float(np.ptp(expected_vertices, axis=0).max()):
         raise FaceDiffError(
@@ -311,39 +321,39 @@ def refuse_other_face(
 
 MOST = 32  # So many of the largest pieces are paired; hair may consist of thousands
 ALIKE = 1.5  # Two pieces differ in size by no more than this factor
-NEAR = 1.0  # Partners' centres lie no further apart than this share of the smaller one's size
+NEAR = 1.0  # PartPairs' centres lie no further apart than this share of the smaller one's size
 WELD = 1e-6  # Vertices nearer than this share of the mesh's size are one: seams of textures do not part a mesh
 
 
 @dataclass(frozen=True, eq=False)
-class Partners:
+class PartPairs:
     """Where to search for the nearest points of each target vertex."""
 
     parts: list[tuple[Indices, Surface]]  # vertices of the target, together all, and the part of the source they lie on
     size: float  # of the whole source
-    alone: list[Indices]  # vertices of each of the target's pieces that has no partner
+    unpaired: list[Indices]  # vertices of each of the target's pieces that has no partner
 
     def nearest(self, points: Array, normals: Array) -> Nearest:
         """The nearest point of each target vertex (Vt, 3) on its part of the source."""
         by_part = [nearest(surface, points[some], normals[some], self.size) for some, surface in self.parts]
         order = np.argsort(np.concatenate([some for some, _ in self.parts]))
-        # Parts list the target's vertices in their own order; sorting brings the rows back to that of the mesh.
+        # Parts list the target's vertices in their own order; sorting restores the order of the mesh.
         names = (field.name for field in fields(Nearest))
         return Nearest(**{name: np.concatenate([getattr(part, name) for part in by_part])[order] for name in names})
 
 
-def partners(source: Surface, laid: Surface, features: tuple[Features, Features] | None = None) -> Partners:
+def part_pairs(source: Surface, laid: Surface, features: tuple[Features, Features] | None = None) -> PartPairs:
     """Pair the pieces of a target that is aligned with a source with the source's.
 
-    Partners are about as large and lie about in one place; of all pairings, the one with the least sum of distances
+    PartPairs are about as large and lie about in one place; of all pairings, the one with the least sum of distances
     counts, so that lower teeth are not taken for upper ones. Where the features of both are known, their skins are
-    partners, and what lies on one side of an opening is not searched for on the other. What has no partner is searched
-    for on all of the source, or on its skin.
+    partners, and vertices on one side of an opening are not searched for on the other. Pieces without a partner are
+    searched for on all of the source, or on its skin.
     """
     from scipy.optimize import linear_sum_assignment
 
     labels = [pieces(surface) for surface in (source, laid)]
-    (centres, sizes, kept), (goals, extents, others) = (
+    (centres, sizes, source_labels), (goals, extents, target_labels) = (
         _measured(surface, label) for surface, label in zip((source, laid), labels, strict=True)
     )
     away = np.linalg.norm(goals[:, None] - centres[None], axis=2)
@@ -354,25 +364,28 @@ def partners(source: Surface, laid: Surface, features: tuple[Features, Features]
     rest = source
     if features is not None:
         is_skin = [
-            np.isin(names, label[own.skin]) for names, label, own in zip((kept, others), labels, features, strict=True)
+            np.isin(names, label[pieces_of_target.skin])
+            for names, label, pieces_of_target in zip((source_labels, target_labels), labels, features, strict=True)
         ]
         cost[is_skin[1]] = 1e6
         cost[:, is_skin[0]] = 1e6
         # Lashes go with the lids that they grow from, which are not the partner's.
-        own = [np.flatnonzero(labels[1] == name) for name in others]
-        cost[lash_pieces(laid.vertices, own, features[1])] = 1e6
+        pieces_of_target = [np.flatnonzero(labels[1] == name) for name in target_labels]
+        cost[lash_pieces(laid.vertices, pieces_of_target, features[1])] = 1e6
         rest = Surface(source.vertices, source.faces[features[0].skin[source.faces[:, 0]]])
     # Every piece may also stay without a partner, which costs as much as a partner at the limit.
     cost = np.concatenate([cost, np.ones((len(goals),) * 2)], axis=1)
     parts, left = [], np.ones(len(laid.vertices), bool)
     for row, column in zip(*linear_sum_assignment(cost), strict=True):
-        some = np.flatnonzero(labels[1] == others[row])
-        if column < len(kept):
-            parts.append((some, Surface(source.vertices, source.faces[labels[0][source.faces[:, 0]] == kept[column]])))
+        some = np.flatnonzero(labels[1] == target_labels[row])
+        if column < len(source_labels):
+            parts.append(
+                (some, Surface(source.vertices, source.faces[labels[0][source.faces[:, 0]] == source_labels[column]]))
+            )
             left[some] = False
-    alone = np.flatnonzero(left)
-    alone = alone[np.argsort(labels[1][alone], kind="stable")]
-    cuts = np.flatnonzero(np.diff(labels[1][alone])) + 1
+    unpaired = np.flatnonzero(left)
+    unpaired = unpaired[np.argsort(labels[1][unpaired], kind="stable")]
+    cuts = np.flatnonzero(np.diff(labels[1][unpaired])) + 1
     if features is not None:
         codes, sides = features[1].codes, features[0].codes[rest.faces]
         for code in np.unique(codes[left & (codes > 0)]):
@@ -382,7 +395,7 @@ def partners(source: Surface, laid: Surface, features: tuple[Features, Features]
             left[some] = False
     if left.any():
         parts.append((np.flatnonzero(left), rest))
-    return Partners(parts, source.size, np.split(alone, cuts))
+    return PartPairs(parts, source.size, np.split(unpaired, cuts))
 
 
 def pieces(surface: Surface) -> Indices:
@@ -425,7 +438,7 @@ WARP = 0.5, 1.2
 def _bent(
     source: Surface,
     laid: Surface,
-    places: Partners,
+    pairs: PartPairs,
     marks: Landmarks | None,
     features: tuple[Features, Features] | None,
 ) -> Surface:
@@ -435,17 +448,17 @@ def _bent(
     rim, rim_pull = (
         (np.zeros(0, np.int64), np.zeros((0, 3))) if features is None else _rims(base.vertices, laid, *features)
     )
-    held, held_pull, held_trust = _held(source, base, marks)
+    anchors, anchor_pull, anchor_trust = _held(source, base, marks)
     bent = base
     for stiffness in STIFFNESSES:
         # Nearest points of a mesh that is still far away are often wrong: they count less the less the surfaces face
         # the same way, and a stiff target follows them only on average.
-        there = places.nearest(bent.vertices, bent.normals)
-        trust = np.clip(2.0 * there.cosines - 0.5, 0.0, 1.0)
-        trust *= np.clip((FAR - there.distances / source.size) / (FAR - CLOSE), 0.0, 1.0)
-        pull = there.points - base.vertices
+        matches = pairs.nearest(bent.vertices, bent.normals)
+        trust = np.clip(2.0 * matches.cosines - 0.5, 0.0, 1.0)
+        trust *= np.clip((FAR - matches.distances / source.size) / (FAR - CLOSE), 0.0, 1.0)
+        pull = matches.points - base.vertices
         pull[rim], trust[rim] = rim_pull, RIM_TRUST
-        pull[held], trust[held] = held_pull, held_trust
+        pull[anchors], trust[anchors] = anchor_pull, anchor_trust
         bent = Surface(base.vertices + smooth_field(pull, trust, edges, stiffness), laid.faces)
     return bent
 
@@ -459,13 +472,13 @@ def _held(source: Surface, base: Surface, marks: Landmarks | None) -> tuple[Indi
         return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
     steps = marks.source.points(source.vertices) - marks.target.points(base.vertices)
     weights = marks.target.weights
-    held, place_in = np.unique(marks.target.corners, return_inverse=True)
+    anchors, place_in = np.unique(marks.target.corners, return_inverse=True)
     place_in = place_in.reshape(weights.shape)  # NumPy 2.0 returns it with one axis or two
-    total, pull = np.zeros(len(held)), np.zeros((len(held), 3))
+    total, pull = np.zeros(len(anchors)), np.zeros((len(anchors), 3))
     np.add.at(total, place_in, weights)
     np.add.at(pull, place_in, weights[:, :, None] * steps[:, None])
     some = total > 1e-9
-    return held[some], pull[some] / total[some, None], LANDMARK_TRUST * np.minimum(total[some], 1.0)
+    return anchors[some], pull[some] / total[some, None], LANDMARK_TRUST * np.minimum(total[some], 1.0)
 
 
 def _sides(features: tuple[Features, Features]) -> list[tuple[int, Array, Array, Indices, float]]:
@@ -474,43 +487,43 @@ def _sides(features: tuple[Features, Features]) -> list[tuple[int, Array, Array,
     for index, (one, two) in enumerate(zip(features[0].openings, features[1].openings, strict=True)):
         if one is None or two is None:
             continue
-        for side, goal, own, seeds in (
+        for side, goal, curve, seeds in (
             (1, one.upper, two.upper, two.upper_seeds),
             (2, one.lower, two.lower, two.lower_seeds),
         ):
             # Curves are known to a pixel or two: what lies nearer is left to the nearest points.
-            apart = np.linalg.norm(goal - own, axis=1, keepdims=True)
-            step = (goal - own) * np.clip(1.0 - KNOWN_TO * two.width / np.maximum(apart, 1e-12), 0.0, None)
-            sides.append((2 * index + side, own + step, own, seeds, two.width))
+            apart = np.linalg.norm(goal - curve, axis=1, keepdims=True)
+            step = (goal - curve) * np.clip(1.0 - KNOWN_TO * two.width / np.maximum(apart, 1e-12), 0.0, None)
+            sides.append((2 * index + side, curve + step, curve, seeds, two.width))
     return sides
 
 
-def _warp(points: Array, features: Features, seen: Features) -> Array:
+def _warp(points: Array, features: Features, target_features: Features) -> Array:
     """Displacements (V, 3) that bring the target's openings onto the source's, and fade away from them."""
-    sides = _sides((features, seen))
-    total, weight, most = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
-    for code, goal, own, _, width in sides:
-        allowed = seen.codes != OPPOSITE[code]
+    sides = _sides((features, target_features))
+    total, weight, reach = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
+    for code, goal, curve, _, width in sides:
+        allowed = target_features.codes != OPPOSITE[code]
         # Every second sample is enough: the Gaussians are eight times as wide as the gaps between these samples.
-        square = np.square(points[allowed, None] - own[None, ::2]).sum(axis=2)
+        square = np.square(points[allowed, None] - curve[None, ::2]).sum(axis=2)
         near = np.exp(-square / (WARP[0] * width) ** 2)
-        total[allowed] += near @ (goal - own)[::2]
+        total[allowed] += near @ (goal - curve)[::2]
         weight[allowed] += near.sum(axis=1)
-        most[allowed] = np.maximum(most[allowed], np.exp(-square.min(axis=1) / (WARP[1] * width) ** 2))
+        reach[allowed] = np.maximum(reach[allowed], np.exp(-square.min(axis=1) / (WARP[1] * width) ** 2))
     # Far away the weights vanish and the fading does first.
-    return np.asarray(most[:, None] * total / np.maximum(weight, 1e-12)[:, None])
+    return np.asarray(reach[:, None] * total / np.maximum(weight, 1e-12)[:, None])
 
 
-def _rims(base: Array, laid: Surface, features: Features, seen: Features) -> tuple[Indices, Array]:
+def _rims(base: Array, laid: Surface, features: Features, target_features: Features) -> tuple[Indices, Array]:
     """Vertices along the openings, and displacements (N, 3) from the base that lay them on the source's openings."""
     from scipy.spatial import cKDTree
 
     names, pulls = [], []
-    for code, goal, own, seeds, width in _sides((features, seen)):
-        away, sample = cKDTree(own).query(laid.vertices[seeds])
-        kept = (away < RIM * width) & (seen.codes[seeds] == code)
-        names.append(seeds[kept])
-        pulls.append((laid.vertices[seeds] + (goal - own)[sample] - base[seeds])[kept])
+    for code, goal, curve, seeds, width in _sides((features, target_features)):
+        away, sample = cKDTree(curve).query(laid.vertices[seeds])
+        near = (away < RIM * width) & (target_features.codes[seeds] == code)
+        names.append(seeds[near])
+        pulls.append((laid.vertices[seeds] + (goal - curve)[sample] - base[seeds])[near])
     # Near a corner a vertex may lie along both curves: the upper one, which comes first, keeps it.
     rim = np.concatenate([np.zeros(0, np.int64), *names])
     rim, first = np.unique(rim, return_index=True)
@@ -519,9 +532,9 @@ def _rims(base: Array, laid: Surface, features: Features, seen: Features) -> tup
 
 def edges_of(faces: Indices) -> Indices:
     """Edges (E, 2), each once."""
-    both = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    both = np.unique(np.sort(both, axis=1), axis=0)
-    return both[both[:, 0] != both[:, 1]]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    return edges[edges[:, 0] != edges[:, 1]]
 
 
 def smooth_field(values: Array, trust: Array, edges: Indices, stiffness: float) -> Array:
@@ -558,5 +571,5 @@ def _adjacency(edges: Indices, count: int) -> csr_array:
     """The symmetric (V, V) matrix that is 1 for every edge."""
     from scipy.sparse import csr_array
 
-    both = np.concatenate([edges, edges[:, ::-1]])
-    return csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
+    pairs = np.concatenate([edges, edges[:, ::-1]])
+    return csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))

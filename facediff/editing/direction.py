@@ -1,28 +1,30 @@
-"""Direction: keys over time for style, expressiveness, head, brows and whatever else an animation is controlled by.
+"""Direction: keys over time for style, expressiveness, head, brows and the other controls of an animation.
 
-From top to bottom: the channels that keys can be set for; :class:`Key`, and :class:`Direction`, whose curves are
-evaluated at any times; and its files, JSON and CSV, which docs/animation_controls.md describes.
+From top to bottom: the channels of keys; :class:`Key` and :class:`Direction`; its files, JSON and CSV, which
+docs/animation_controls.md describes; and the curves between keys.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, damaged
 from facediff.spaces.arkit import ARKIT
 from facediff.utils import ranges
-from facediff.utils.hints import Range, read, shown
-from facediff.utils.limits import FRAME_RATES, quoted
+from facediff.utils.hints import Range, check_number, shown
+from facediff.utils.limits import FRAME_RATES, check_format, quoted
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_table, write_json, write_rows
+from facediff.utils.records import read_record
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -30,18 +32,18 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 Interpolation = Literal["step", "linear", "smooth"]
-"""How a channel goes from a key to the next one: it keeps the value until then, or follows a line or a smooth curve."""
+"""Interpolation from a key to the next one: constant, a line, or a smooth curve."""
 
 FORMAT, VERSION = "facediff direction", 1
 METADATA = "direction"
 """Metadata key of an animation: the direction that it was made with."""
 STEP_SECONDS = 0.2
-"""What a step takes in an animation, so that nothing pops; it arrives at its key."""
+"""Duration of a step in an animation, so that nothing pops; it ends at its key."""
 TIMES = Range(0, 86_400)
 SLOPES = Range(-1e6, 1e6)
 MOST_KEYS = 100_000
 INSTEAD_OF = ("acting", "blinks")
-"""Options whose work keys can stand for: a page turns it into keys."""
+"""Options that keys can replace: a page turns their motion into keys."""
 COLUMNS = ("time", "frame", "channel", "value", "interpolation", "slope")
 _TIMECODE = re.compile(r"([0-9]{1,2}):([0-9]{2}):([0-9]{2})([:;.,])([0-9]{1,3})", re.ASCII)
 
@@ -51,10 +53,10 @@ class Channel:
     """Something that can be directed over time.
 
     Attributes:
-        range: the numbers that it takes; None for a text, such as that of ``--style``.
+        range: the numbers that it takes; None for a text, as of ``--style``.
         regions: whether it can be set for a region of the face alone, ``expressiveness.lips``.
         parts: other names that may follow the dot.
-        in_model: whether it decides what the model generates; else it changes finished motion.
+        in_model: whether it controls the model; else it changes finished motion.
     """
 
     range: Range | None
@@ -115,24 +117,19 @@ class Key:
         Key(time=1.5, channel='expressiveness.upper_face', value=1.4, interpolation='smooth', slope=None)
     """
 
-    time: float
+    time: Annotated[float, TIMES]
     channel: str
     value: float | str
     interpolation: Interpolation = "smooth"
-    slope: float | None = None
+    slope: Annotated[float, SLOPES] | None = None
 
     def __post_init__(self) -> None:
-        _number("time", self.time, TIMES)
-        limits = channel_of(str(self.channel)).range
+        ranges.check_options(self)
+        limits = channel_of(self.channel).range
         if limits is not None:
-            _number("value", self.value, limits)
+            check_number(self.channel, "value", self.value, limits.least, limits.most)
         elif not isinstance(self.value, str) or not self.value.strip():
             raise FaceDiffError(f"value {shown(self.value)}: expected a text, as --{self.channel} takes it")
-        if self.interpolation not in get_args(Interpolation):
-            remedy = choices(str(self.interpolation), get_args(Interpolation))
-            raise FaceDiffError(f"interpolation {shown(self.interpolation)}: {remedy}")
-        if self.slope is not None:
-            _number("slope", self.slope, SLOPES)
         # Numbers are floats from here on, also where a whole number or one of NumPy's was given.
         for name in ("time", "value", "slope"):
             number = getattr(self, name)
@@ -140,21 +137,16 @@ class Key:
                 object.__setattr__(self, name, float(number))
 
 
-def _number(name: str, value: object, limits: Range) -> None:
-    if value not in limits:
-        raise FaceDiffError(f"{name} {shown(value)}: expected {limits.numbers()}")
-
-
 @dataclass(frozen=True)
 class Direction:
     """Keys over time. Channels without a key stay as the options of ``facediff animate`` have them.
 
-    Before its first key a channel has that key's value, and after its last one that one's.
+    Before its first key a channel has the first value, and after its last key the last one.
 
     Args:
         keys: in any order; no two of one channel at one time.
-        source: what messages call it, such as the file that it was read from.
-        instead_of: options of :data:`INSTEAD_OF` whose work the keys stand for; with them it would be done twice.
+        source: its name in messages, such as the file that it was read from.
+        instead_of: options of :data:`INSTEAD_OF` that the keys replace; both together would apply the motion twice.
 
     Example:
         >>> direction = Direction([Key(0, "expressiveness", 1.0), Key(2, "expressiveness", 2.0)])
@@ -170,13 +162,11 @@ class Direction:
         if not 0 < len(self.keys) <= MOST_KEYS:
             raise FaceDiffError(f"{self.source}: holds {len(self.keys)} keys; expected 1 to {MOST_KEYS}")
         ordered = sorted(self.keys, key=lambda key: key.time)
-        taken: set[tuple[str, float]] = set()
+        times: set[tuple[str, float]] = set()
         for key in ordered:
-            if (key.channel, key.time) in taken:
-                raise FaceDiffError(
-                    f"{self.source}: time {key.time:g}: {key.channel} has two keys then; keep one of them"
-                )
-            taken.add((key.channel, key.time))
+            if (key.channel, key.time) in times:
+                raise FaceDiffError(f"{self.source}: time {key.time:g}: {key.channel} has two keys; keep one of them")
+            times.add((key.channel, key.time))
         object.__setattr__(self, "keys", tuple(ordered))
         object.__setattr__(self, "instead_of", tuple(dict.fromkeys(self.instead_of)))
 
@@ -189,7 +179,7 @@ class Direction:
         return {name: tuple(keys) for name, keys in by_channel.items()}
 
     def under(self, name: str) -> dict[str, tuple[Key, ...]]:
-        """The channels of one name, whatever follows the dot."""
+        """The channels with this name before the dot."""
         return {channel: keys for channel, keys in self.channels.items() if channel.partition(".")[0] == name}
 
     def constant(self, channel: str) -> float | str | None:
@@ -210,30 +200,27 @@ class Direction:
         return text_shares(self.channels[channel], times)
 
     def refuse_both(self, name: str) -> None:
-        """Refuse keys of what an option of this name sets from beginning to end, or that stand for what it does."""
-        if name in self.instead_of:
-            raise FaceDiffError(f"{self.source}: instead_of: the keys do what --{name} did; omit --{name}")
-        for channel in self.under(name):
-            raise FaceDiffError(f"{self.source}: channel {channel}: --{name} says the same; give one of them")
+        """Refuse keys next to an option that sets the same channel, or that they replace."""
+        fields = ["instead_of"] * (name in self.instead_of) + [f"channel {channel}" for channel in self.under(name)]
+        if fields:
+            raise FaceDiffError(f"{self.source}: {fields[0]}: the keys do the same as --{name}; give one of them")
 
     def refuse_model_channels(self, exported: bool = False) -> None:
-        """Refuse keys of what only a model can follow, such as the style, and of those only one with PyTorch."""
-        for channel in self.channels:
-            if channel_of(channel).in_model:
-                reason = (
-                    "needs the model, and the animation is finished; give the keys to `facediff animate --direction`"
-                )
-                if exported:
-                    reason = (
-                        "needs a checkpoint (.ckpt of a training), and this model is an exported one; leave these keys "
-                        "out, or give the checkpoint"
-                    )
-                raise FaceDiffError(f"{self.source}: channel {channel}: {reason}")
+        """Refuse channels of the model, such as the style, for a finished animation or an exported model."""
+        channel = next((name for name in self.channels if channel_of(name).in_model), None)
+        if channel is not None:
+            reason = (
+                "needs a checkpoint (.ckpt of a training), and this model is an exported one; leave these keys out, or "
+                "give the checkpoint"
+                if exported
+                else "needs the model, and the animation is finished; give the keys to `facediff animate --direction`"
+            )
+            raise FaceDiffError(f"{self.source}: channel {channel}: {reason}")
 
     def without_model_channels(self) -> Direction | None:
-        """The keys of what changes finished motion; None if there are none."""
-        left = tuple(key for key in self.keys if not channel_of(key.channel).in_model)
-        return replace(self, keys=left) if left else None
+        """The keys of channels that change finished motion; None if there are none."""
+        keys = tuple(key for key in self.keys if not channel_of(key.channel).in_model)
+        return replace(self, keys=keys) if keys else None
 
     def rows(self) -> list[dict[str, float | str]]:
         """The keys as the rows of a file."""
@@ -249,7 +236,7 @@ class Direction:
         ]
 
     def _content(self) -> dict[str, object]:
-        """What a JSON file holds."""
+        """The content of a JSON file."""
         instead = {"instead_of": list(self.instead_of)} if self.instead_of else {}
         return {"format": FORMAT, "version": VERSION, **instead, "keys": self.rows()}
 
@@ -260,15 +247,14 @@ class Direction:
     def save(self, path: str | Path) -> Path:
         """Write a .json file that :func:`read_direction` reads, or a .csv, which has no place for ``instead_of``."""
         path = Path(path)
-        if path.suffix.lower() == ".json":
+        suffix = path.suffix.lower()
+        if suffix not in (".json", ".csv") or (suffix == ".csv" and self.instead_of):
+            raise FaceDiffError(f"{path}: expected .json, or .csv for keys without instead_of")
+        if suffix == ".json":
             write_json(path, self._content())
-        elif path.suffix.lower() == ".csv":
-            if self.instead_of:
-                raise FaceDiffError(f"{path}: instead_of: a table has no place for it; choose .json")
+        else:
             empty = {"slope": ""} if any(key.slope is not None for key in self.keys) else {}
             write_rows(path, [{**empty, **row} if empty else row for row in self.rows()], line_end="\n")
-        else:
-            raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected .json or .csv')
         return path
 
     @classmethod
@@ -277,32 +263,40 @@ class Direction:
 
         Args:
             content: the object, a list of rows, or the text of either.
-            source: what messages call it.
-            frame_rate: of frames and timecodes, where the content does not say it.
+            source: its name in messages.
+            frame_rate: of frames and timecodes, where the content states none.
         """
         if isinstance(content, str):
             content = parse_json(content, source)
         if isinstance(content, list):
             content = {"keys": content}
-        if not isinstance(content, dict) or not isinstance(content.get("keys"), list):
-            raise FaceDiffError(f'{source}: keys: expected an object with a list of rows called "keys"')
-        stated = (content.get("format", FORMAT), content.get("version", VERSION))
-        unknown = sorted(content.keys() - {"format", "version", "frame_rate", "instead_of", "keys"})
-        if unknown or stated != (FORMAT, VERSION):
-            raise FaceDiffError(
-                f"{source}: is {' '.join(map(shown, stated))} with {quoted(unknown)}; expected {FORMAT} {VERSION} with "
-                f"format, version, frame_rate, instead_of and keys alone"
-            )
-        frame_rate = content.get("frame_rate", frame_rate)
-        if frame_rate is not None and frame_rate not in Range(*FRAME_RATES):
-            raise FaceDiffError(
-                f"{source}: frame_rate {shown(frame_rate)}: expected {Range(*FRAME_RATES).numbers()} (frames a second)"
-            )
-        instead_of = content.get("instead_of", [])
-        if not isinstance(instead_of, list) or not all(name in INSTEAD_OF for name in instead_of):
-            raise FaceDiffError(f"{source}: instead_of {shown(instead_of)}: expected a list of {', '.join(INSTEAD_OF)}")
-        keys = tuple(_read_keys(enumerate(content["keys"], 1), source, frame_rate))
-        return cls(keys, source, instead_of)
+        record = read_record(_Content, content, source)
+        check_format(source, f"{record.format} {record.version}", f"{FORMAT} {VERSION}")
+        keys = tuple(_read_keys(enumerate(record.keys, 1), source, record.frame_rate or frame_rate))
+        return cls(keys, source, record.instead_of)
+
+
+@dataclass(frozen=True)
+class _Content:
+    """A JSON file of keys."""
+
+    keys: tuple[Any, ...]
+    format: str = FORMAT
+    version: int = VERSION
+    frame_rate: ranges.FrameRate | None = None
+    instead_of: tuple[Literal["acting", "blinks"], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A key in a file; tables hold numbers as texts."""
+
+    channel: str
+    value: Any
+    time: Any = None
+    frame: Any = None
+    interpolation: Interpolation = "smooth"
+    slope: Any = None
 
 
 def _mood(**values: float) -> tuple[Key, ...]:
@@ -352,7 +346,7 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
 
     Args:
         path: .json or .csv, an animation (.npz) that was made with a direction, or the name of a mood.
-        frame_rate: of frames and timecodes, where the file does not say it.
+        frame_rate: of frames and timecodes, where the file states none.
     """
     if is_mood(path):
         return Direction(MOODS[str(path)], str(path))
@@ -397,74 +391,50 @@ def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     if not {"channel", "value"} <= set(header) <= set(COLUMNS) or len(set(header)) < len(header):
         raise FaceDiffError(f"{path}: row 1: has the columns {quoted(header)}; {remedy}, each once")
     for number, row in enumerate(rows, 2):
-        if len(row) > len(header) and any(cell.strip() for cell in row[len(header) :]):
-            raise FaceDiffError(f"{path}: row {number}: has {len(row)} cells for {len(header)} columns; quote commas")
-        cells = {name: cell.strip() for name, cell in zip(header, row, strict=False)}
-        if any(cells.values()):
-            yield number, {name: cell for name, cell in cells.items() if cell}
+        # A cell beyond the header gets an empty name, which is refused as an unknown field.
+        cells = {name: cell.strip() for name, cell in zip_longest(header, row, fillvalue="") if cell.strip()}
+        if cells:
+            yield number, cells
 
 
 def _read_keys(rows: Iterable[tuple[int, object]], source: str, frame_rate: float | None) -> Iterator[Key]:
     """Keys of rows with their numbers; texts that stand for numbers are read."""
     for number, row in rows:
-        try:
-            yield _read_key(row, frame_rate)
-        except FaceDiffError as error:
-            raise FaceDiffError(f"{source}: row {number}: {error}") from error
+        location = f"{source}: row {number}"
+        with damaged(location, f"expected {', '.join(COLUMNS)}"):
+            key = _read_key(read_record(_Row, row, location), location, frame_rate)
+        yield key
 
 
-def _read_key(row: object, frame_rate: float | None) -> Key:
-    fits = isinstance(row, Mapping) and {"channel", "value"} <= row.keys() <= set(COLUMNS)
-    if not isinstance(row, Mapping) or not fits or ("time" in row) == ("frame" in row):
-        raise FaceDiffError(f"is {shown(row)}; expected {', '.join(COLUMNS)}, with either a time or a frame")
-    channel, value, slope = row["channel"], row["value"], row.get("slope")
-    if isinstance(channel, str):
-        limits = channel_of(channel).range
-        if limits is not None and isinstance(value, str):  # a cell of a table
-            value = _read(limits, "value", value)
-        if limits is None and slope is not None:
-            raise FaceDiffError(f"slope {shown(slope)}: {channel} holds texts, which have no slope; omit it")
-    if isinstance(slope, str):
-        slope = _read(SLOPES, "slope", slope)
-    time = _time(row["time"], frame_rate) if "time" in row else _seconds("frame", row["frame"], frame_rate)
-    return Key(time, cast(str, channel), value, row.get("interpolation", "smooth"), slope)
+def _read_key(row: _Row, source: str, frame_rate: float | None) -> Key:
+    limits = channel_of(row.channel).range
+    if (row.time is None) == (row.frame is None) or (limits is None and row.slope is not None):
+        raise FaceDiffError(f"{source}: expected either a time or a frame, and a slope of numbers alone")
 
+    def number(name: str, value: object, limits: Range, remedy: str = "") -> float:
+        return check_number(source, name, value, limits.least, limits.most, text=True, remedy=remedy)
 
-def _time(time: object, frame_rate: float | None) -> float:
-    """Seconds, from a number of them or a timecode: ``00:00:01:12`` (frames), or ``00:00:01.480``."""
-    if not isinstance(time, str):
-        _number("time", time, TIMES)
-        return cast(float, time)
-    if not (timecode := _TIMECODE.fullmatch(time)):
-        try:
-            return _read(TIMES, "time", time)
-        except FaceDiffError as error:
-            raise FaceDiffError(f"{error}, or a timecode such as 00:00:01:12") from error
-    hours, minutes, seconds = (int(number) for number in timecode.groups()[:3])
-    whole = 3600 * hours + 60 * minutes + seconds
-    if timecode[4] in ".,":
-        return whole + int(timecode[5]) / 10 ** len(timecode[5])
-    if frame_rate is not None and int(timecode[5]) >= math.ceil(frame_rate):
-        raise FaceDiffError(f"time {time}: has frame {timecode[5]} of {frame_rate:g} a second; expected a smaller one")
-    return whole + _seconds("time", int(timecode[5]), frame_rate)
+    def seconds(name: str, frame: object) -> float:
+        if frame_rate is None:
+            raise FaceDiffError(f'{source}: {name} counts frames; state how many there are a second, "frame_rate"')
+        return number(name, frame, Range(0, TIMES.most * FRAME_RATES[1])) / frame_rate
 
-
-def _read(limits: Range, name: str, text: str) -> float:
-    """The number in a cell of a table."""
-    try:
-        return cast(float, read(Annotated[float, limits], text.strip()))
-    except ValueError as error:
-        raise FaceDiffError(f"{name} {shown(text)}: expected {error}") from error
-
-
-def _seconds(name: str, frame: object, frame_rate: float | None) -> float:
-    limits = Range(0, TIMES.most * FRAME_RATES[1])
-    if isinstance(frame, str):
-        frame = _read(limits, name, frame)
-    _number(name, frame, limits)
-    if frame_rate is None:
-        raise FaceDiffError(f'{name} {shown(frame)}: counts frames; say how many there are a second, "frame_rate"')
-    return cast(float, frame) / frame_rate
+    if row.frame is not None:
+        time = seconds("frame", row.frame)
+    elif isinstance(row.time, str) and (timecode := _TIMECODE.fullmatch(row.time)):
+        # ``00:00:01:12`` (frames), or ``00:00:01.480``.
+        hours, minutes, whole_seconds, rest = (int(timecode[group]) for group in (1, 2, 3, 5))
+        if timecode[4] in ".,":
+            fraction = rest / 10 ** len(timecode[5])
+        else:
+            last = math.inf if frame_rate is None else math.ceil(frame_rate) - 1
+            fraction = seconds("time", number(f"time {row.time}: the frame", rest, Range(0, last)))
+        time = 3600 * hours + 60 * minutes + whole_seconds + fraction
+    else:
+        time = number("time", row.time, TIMES, "or a timecode such as 00:00:01:12")
+    value = row.value if limits is None else number("value", row.value, limits)
+    slope = None if row.slope is None else number("slope", row.slope, SLOPES)
+    return Key(time, row.channel, value, row.interpolation, slope)
 
 
 # Curves.
@@ -475,38 +445,33 @@ def curve(keys: Sequence[Key], times: npt.ArrayLike, *, eased: bool = False) -> 
 
     ``step`` keeps a key's value until the next key. ``linear`` goes there on a line. ``smooth`` is the cubic Hermite
     curve between the values v₀, v₁ and the slopes s₀, s₁ at both keys: with t from 0 to 1 over d seconds,
-    (2t³ − 3t² + 1) v₀ + (t³ − 2t² + t) d s₀ + (3t² − 2t³) v₁ + (t³ − t²) d s₁. Slopes that are not given are those of
-    :func:`slopes`.
+    (2t³ − 3t² + 1) v₀ + (t³ − 2t² + t) d s₀ + (3t² − 2t³) v₁ + (t³ − t²) d s₁. :func:`slopes` computes the slopes
+    that are not given.
 
     Args:
         keys: of one channel of numbers.
         times: seconds.
         eased: let a step take :data:`STEP_SECONDS`, or the time between its keys where that is shorter.
     """
-    when = np.asarray([key.time for key in keys], np.float64)
+    segments = _Segments(keys, times)
+    index, following, t, kinds = segments.index, segments.following, segments.t, segments.kinds
     values = np.asarray([float(key.value) for key in keys], np.float64)
-    place, now = _places(when, times)
-    following = np.minimum(place + 1, len(keys) - 1)
-    first, last = values[place], values[following]
-    # Past the last key both are the same, and the division must not give NaN.
-    span = np.maximum(when[following] - when[place], 1e-12)
-    t = np.clip((now - when[place]) / span, 0.0, 1.0)
-    kinds = np.array([key.interpolation for key in keys])[place]
+    first, last = values[index], values[following]
     values_at = np.array(first)
     linear = kinds == "linear"
     values_at[linear] = (first + t * (last - first))[linear]
     smooth = kinds == "smooth"
     if smooth.any():
         tangents = slopes(keys)
-        t, span, first, last = t[smooth], span[smooth], first[smooth], last[smooth]
-        leaving, arriving = span * tangents[place[smooth]], span * tangents[following[smooth]]
+        t, span, first, last = t[smooth], segments.span[smooth], first[smooth], last[smooth]
+        leaving, arriving = span * tangents[index[smooth]], span * tangents[following[smooth]]
         # Written as a distance from the first value, so that equal values give that value to the last bit.
         values_at[smooth] = (
             first + (3 * t**2 - 2 * t**3) * (last - first) + (t**3 - 2 * t**2 + t) * leaving + (t**3 - t**2) * arriving
         )
     if eased:
         step = kinds == "step"
-        values_at[step] += ((values[following] - values[place]) * _arriving(now, when, place, following))[step]
+        values_at[step] += ((values[following] - values[index]) * segments.step_share())[step]
     limits = channel_of(keys[0].channel).range
     return values_at if limits is None else np.clip(values_at, limits.least, limits.most)
 
@@ -515,9 +480,9 @@ def slopes(keys: Sequence[Key]) -> Array:
     """Change a second at each key (K,): as given, or else so that the curve does not overshoot.
 
     A slope that is not given is 0 at the first and the last key, and wherever the value turns round or stands still;
-    elsewhere it is that of the line between the two neighbours, and at most three times that of either neighbouring
-    line, which keeps a cubic curve between its keys' values (Fritsch and Carlson, "Monotone piecewise cubic
-    interpolation", SIAM Journal on Numerical Analysis 17(2), 1980).
+    elsewhere it is the slope of the line between the two neighbours, limited to three times the slope of either
+    neighbouring line, which keeps a cubic curve between its keys' values (Fritsch and Carlson, "Monotone piecewise
+    cubic interpolation", SIAM Journal on Numerical Analysis 17(2), 1980).
     """
     when = np.asarray([key.time for key in keys], np.float64)
     values = np.asarray([float(key.value) for key in keys], np.float64)
@@ -526,46 +491,50 @@ def slopes(keys: Sequence[Key]) -> Array:
         lines = np.diff(values) / np.diff(when)
         before, after = lines[:-1], lines[1:]
         middle = (values[2:] - values[:-2]) / (when[2:] - when[:-2])
-        most = 3 * np.minimum(np.abs(before), np.abs(after))
-        key_slopes[1:-1] = np.where(before * after > 0, np.sign(middle) * np.minimum(np.abs(middle), most), 0.0)
-    own_slopes = [(index, key.slope) for index, key in enumerate(keys) if key.slope is not None]
-    for index, slope in own_slopes:
-        key_slopes[index] = slope
+        limit = 3 * np.minimum(np.abs(before), np.abs(after))
+        key_slopes[1:-1] = np.where(before * after > 0, np.sign(middle) * np.minimum(np.abs(middle), limit), 0.0)
+    for index, key in enumerate(keys):
+        if key.slope is not None:
+            key_slopes[index] = key.slope
     return key_slopes
 
 
 def text_shares(keys: Sequence[Key], times: npt.ArrayLike, *, eased: bool = False) -> dict[str, Array]:
     """How much each text of a channel's keys counts (T,) at times (T,), see :meth:`Direction.shares`.
 
-    The arguments are those of :func:`curve`.
+    Arguments as in :func:`curve`.
     """
-    when = np.asarray([key.time for key in keys], np.float64)
-    place, now = _places(when, times)
-    following = np.minimum(place + 1, len(keys) - 1)
-    t = np.clip((now - when[place]) / np.maximum(when[following] - when[place], 1e-12), 0.0, 1.0)
-    kinds = np.array([key.interpolation for key in keys])[place]
-    steps = _arriving(now, when, place, following) if eased else np.zeros(len(now))
+    segments = _Segments(keys, times)
+    t, kinds = segments.t, segments.kinds
+    steps = segments.step_share() if eased else np.zeros(len(t))
     share = np.where(kinds == "step", steps, np.where(kinds == "linear", t, 3 * t**2 - 2 * t**3))
     texts = list(dict.fromkeys(str(key.value) for key in keys))
     number = np.array([texts.index(str(key.value)) for key in keys])
-    shares = {text: np.zeros(len(now)) for text in texts}
+    shares = {}
     for index, text in enumerate(texts):
-        leaving, arriving = number[place] == index, number[following] == index
+        leaving, arriving = number[segments.index] == index, number[segments.following] == index
         shares[text] = np.where(leaving & arriving, 1.0, np.where(leaving, 1 - share, np.where(arriving, share, 0.0)))
     return shares
 
 
-def _places(when: Array, times: npt.ArrayLike) -> tuple[npt.NDArray[np.int64], Array]:
-    """The key (T,) that is in force at each time, and the times (T,)."""
-    now = np.atleast_1d(np.asarray(times, np.float64))
-    # Frames are at i / frame rate, and a key there may have been written with fewer digits.
-    place = np.clip(np.searchsorted(when, now + 1e-9, side="right") - 1, 0, len(when) - 1)
-    return place, now
+class _Segments:
+    """The segments between keys in which times (T,) lie: the key before, the key after, and the share t between."""
 
+    def __init__(self, keys: Sequence[Key], times: npt.ArrayLike) -> None:
+        key_times = np.asarray([key.time for key in keys], np.float64)
+        self.times = np.atleast_1d(np.asarray(times, np.float64))
+        # Frames are at i / frame rate, and a key there may have been written with fewer digits.
+        self.index = np.clip(np.searchsorted(key_times, self.times + 1e-9, side="right") - 1, 0, len(keys) - 1)
+        self.following = np.minimum(self.index + 1, len(keys) - 1)
+        self.start, self.end = key_times[self.index], key_times[self.following]
+        # Past the last key both are the same, and the division must not give NaN.
+        self.span = np.maximum(self.end - self.start, 1e-12)
+        self.t = np.clip((self.times - self.start) / self.span, 0.0, 1.0)
+        self.kinds = np.array([key.interpolation for key in keys])[self.index]
 
-def _arriving(now: Array, when: Array, place: npt.NDArray[np.int64], following: npt.NDArray[np.int64]) -> Array:
-    """How far a step to the following key has come (T,): 3t² − 2t³ of the seconds before it."""
-    span = np.minimum(when[following] - when[place], STEP_SECONDS)
-    t = np.clip(1 - (when[following] - now) / np.maximum(span, 1e-12), 0.0, 1.0)
-    # Before the first key and after the last one, nothing follows.
-    return np.where((now < when[place]) | (following == place), 0.0, t * t * (3 - 2 * t))
+    def step_share(self) -> Array:
+        """How far a step to the following key has come (T,): 3t² − 2t³ of the seconds before it."""
+        duration = np.maximum(np.minimum(self.end - self.start, STEP_SECONDS), 1e-12)
+        t = np.clip(1 - (self.end - self.times) / duration, 0.0, 1.0)
+        # Before the first key and after the last one, nothing follows.
+        return np.where((self.times < self.start) | (self.following == self.index), 0.0, t * t * (3 - 2 * t))

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.options import Scales, scales_text
 from facediff.editing.eyes import Array, Eyes, Indices
-from facediff.editing.procedural import EDITED, in_words, noted, room_for
+from facediff.editing.procedural import EDITED, allocate_like, in_words, with_metadata
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.utils.hints import Range, read
 from facediff.utils.numerics import nearest_distances, smooth_step
@@ -42,31 +42,32 @@ def read_factors(scales: Scales | None, option: str = "expressiveness", highest:
     for word in text.split(","):
         name, equals, number = word.rpartition("=")
         name = name.strip() if equals else ALL
-        expected = f"a factor from 0 to {highest:g} (1.2), or factors by region (upper_face=1.5,lips=0.9)"
-        if not name:
-            raise OptionError(option, f"expected {expected}", text)
         try:
             factor = read(Annotated[float, Range(0, highest)], number.strip())
-        except ValueError as error:
-            raise OptionError(option, f"expected {expected}", text) from error
-        if name in factors:
-            raise OptionError(option, f"names {name} twice; give one factor for it", text)
+        except ValueError:
+            factor = None
+        if not name or factor is None or name in factors:
+            raise OptionError(
+                option,
+                f"expected a factor from 0 to {highest:g} (1.2), or one for each region (upper_face=1.5,lips=0.9)",
+                text,
+            )
         factors[name] = factor
     return factors
 
 
 def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], name: str) -> None:
-    """Refuse a region that does not exist, naming those that ``name`` has."""
+    """Refuse a region that the face called ``name`` does not have."""
     for region in factors:
         if region != ALL and region not in regions:
-            raise FaceDiffError(f'{name}: has no region "{region}" to scale: {choices(region, [*regions, ALL])}')
+            raise FaceDiffError(f'{name}: has no region "{region}": {choices(region, [*regions, ALL])}')
 
 
 def scale_regions(
     animation: Animation, factors: Mapping[str, float | npt.NDArray[np.floating]], eyes: Eyes | None = None
 ) -> Animation:
     """Scale how far every vertex goes from the neutral face; the arguments are those of :func:`scaled_regions`."""
-    return noted(animation, scaled_regions(animation, factors, eyes), EDITED, expressiveness_words(factors))
+    return with_metadata(animation, scaled_regions(animation, factors, eyes), EDITED, expressiveness_words(factors))
 
 
 def expressiveness_words(factors: Mapping[str, float | npt.NDArray[np.floating]]) -> str:
@@ -81,8 +82,7 @@ def scaled_regions(
 
     Args:
         animation: with the regions that are named.
-        factors: by region, a number or one for each frame (T,); ``all`` stands for every vertex that no other name
-            covers.
+        factors: by region, a number or one for each frame (T,); ``all`` covers the vertices outside of the others.
         eyes: where they are known, the closing of the lids is left as it is: a blink stays a blink, and lids that meet
             do not run through each other.
     """
@@ -91,19 +91,19 @@ def scaled_regions(
     closing = None
     if eyes is not None and eyes.closing is not None:
         lids, closing = eyes.lids()
-    vertices = room_for(animation.vertices)
+    vertices = allocate_like(animation.vertices)
     count = len(animation.vertices)
     in_frames = {name: np.broadcast_to(np.asarray(value, np.float64), count) for name, value in factors.items()}
-    now: dict[str, float] = {}
+    amounts: dict[str, float] = {}
     for index, frame in enumerate(animation.vertices):
-        before, now = now, {name: float(values[index]) for name, values in in_frames.items()}
+        before, amounts = amounts, {name: float(values[index]) for name, values in in_frames.items()}
         # Factors mostly stand still, and blending the regions costs as much as scaling a frame.
-        if now != before:
-            factor = weights.factors(now).astype(np.float32)
+        if amounts != before:
+            factor = weights.factors(amounts).astype(np.float32)
         offsets = frame - animation.template
         scaled = factor[:, None] * offsets
         if closing is not None:
-            # Vertices of the lids get back what scaling took from their closing, or lose what it added.
+            # The closing of the lids stays as it was before scaling.
             share = np.clip((offsets[lids] * closing).sum(-1) / (closing**2).sum(-1), 0.0, 1.0)
             scaled[lids] += ((1.0 - factor[lids]) * share)[:, None] * closing
         vertices[index] = animation.template + scaled
@@ -115,20 +115,18 @@ class RegionWeights:
     """How much each region counts at each vertex.
 
     Attributes:
-        named: the regions but for ``all``.
+        names: the regions but for ``all``.
         weights: (regions, V), between 0 and 1.
-        rest: (V,) what is left for ``all``.
+        rest: (V,) the remainder, for ``all``.
     """
 
-    named: tuple[str, ...]
+    names: tuple[str, ...]
     weights: Array
     rest: Array
 
     def factors(self, factors: Mapping[str, float]) -> Array:
-        """The factor of every vertex (V,), from those of the regions and ``all`` (1 if absent)."""
-        if not self.named:
-            return np.asarray(np.zeros(len(self.rest)) + self.rest * factors.get(ALL, 1.0))
-        of_regions = np.array([factors[region] for region in self.named]) @ self.weights
+        """The factor of every vertex (V,), from factors of the regions and ``all`` (1 if absent)."""
+        of_regions = np.array([factors[region] for region in self.names]) @ self.weights
         return np.asarray(of_regions + self.rest * factors.get(ALL, 1.0))
 
 
@@ -143,15 +141,15 @@ def region_factors(
 
     A region weighs 1 on its own vertices and falls to 0 over ``fall_off`` outside of it, by the distance d in the
     neutral face: 1 − s(d / fall_off) with s(t) = 3t² − 2t³. Where weights sum to more than 1 they are divided by their
-    sum, and the remainder to 1 belongs to ``all``: together they are a partition of unity. Between a region's factor f
-    and that of the rest, g, vertices at x and y differ by no more than 1.5 |f − g| |x − y| / fall_off, since a distance
+    sum, and the remainder to 1 belongs to ``all``: together they are a partition of unity. With a region's factor f and
+    the factor g of the rest, factors at x and y differ by at most 1.5 |f − g| |x − y| / fall_off, since a distance
     changes no faster than its place, and s no faster than 1.5.
 
     Args:
         template: (V, 3) the neutral face.
         regions: vertex indices by name.
         factors: by region, or ``all`` (1 if absent).
-        name: what has the regions, for the message.
+        name: of the face, for the message.
         fall_off: in the template's unit; 0.06 of the face's size if None.
     """
     return region_weights(template, regions, list(factors), name, fall_off).factors(factors)
@@ -164,21 +162,21 @@ def region_weights(
     name: str = "expressiveness",
     fall_off: float | None = None,
 ) -> RegionWeights:
-    """The weights of regions at every vertex; the arguments are those of :func:`region_factors`."""
+    """The weights of regions at every vertex; arguments as in :func:`region_factors`."""
     check_factors(dict.fromkeys(names, 1.0), regions, name)
-    places = np.asarray(template, np.float64)
-    width = FALL_OFF * float(np.linalg.norm(np.ptp(places, axis=0))) if fall_off is None else fall_off
-    named = [region for region in names if region != ALL]
-    weights = np.zeros((len(named), len(places)))
-    for row, region in zip(weights, named, strict=True):
-        distances = np.full(len(places), np.inf)
+    points = np.asarray(template, np.float64)
+    width = FALL_OFF * float(np.linalg.norm(np.ptp(points, axis=0))) if fall_off is None else fall_off
+    region_names = tuple(region for region in names if region != ALL)
+    weights = np.zeros((len(region_names), len(points)))
+    for row, region in zip(weights, region_names, strict=True):
+        distances = np.full(len(points), np.inf)
         if len(regions[region]):  # a face that was carried to a mesh without the region has none
-            distances = nearest_distances(places, places[regions[region]], width)
+            distances = nearest_distances(points, points[regions[region]], width)
         row[:] = 1.0 - smooth_step(distances / max(width, 1e-12))
     # Where regions overlap, their weights are made to sum to one; without it, two factors of 1 would scale by 2.
     total = weights.sum(axis=0)
     weights /= np.maximum(total, 1.0)
-    return RegionWeights(tuple(named), weights, np.clip(1.0 - total, 0.0, None))
+    return RegionWeights(region_names, weights, np.clip(1.0 - total, 0.0, None))
 
 
 def rest_weights(

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.editing.correspondence import LIDS_AT_REST, Correspondence
-from facediff.editing.face_features import Features, Seen
+from facediff.editing.face_features import Features, FrontView
 from facediff.editing.lids import LidEdges, eyeball_depth, eyeball_triangles, lid_edges
 from facediff.editing.surface import Surface
 
@@ -71,13 +71,13 @@ def check_eyes(
     source, target = correspondence.features
     if source is None or target is None:
         return None, [], []
-    own = [lid_edges(correspondence.source_vertices, source, eye) for eye in (0, 1)]
-    if own[0] is None or own[1] is None:
+    source_edges = [lid_edges(correspondence.source_vertices, source, eye) for eye in (0, 1)]
+    if source_edges[0] is None or source_edges[1] is None:
         return None, [], []
     faults, remarks = [], []
-    blink, left = fullest_blink(animation, [edges for edges in own if edges is not None])
+    blink, left = fullest_blink(animation, [edges for edges in source_edges if edges is not None])
     posed = _laid(correspondence, carried.vertices[blink])
-    new = [lid_edges(correspondence.laid.vertices, target, eye) for eye in (0, 1)]
+    target_edges = [lid_edges(correspondence.laid.vertices, target, eye) for eye in (0, 1)]
     gaps: list[float] | None = None
     holes: list[float] = []
     passed: list[float] | None = None
@@ -86,22 +86,26 @@ def check_eyes(
         pass
     elif correspondence.lids == LIDS_AT_REST:
         remarks.append("its lids stay at rest")
-    elif new[0] is None or new[1] is None:
-        names = ["right" if new[0] is None else "left"] if (new[0] is None) != (new[1] is None) else ["right", "left"]
+    elif target_edges[0] is None or target_edges[1] is None:
+        names = (
+            ["right" if target_edges[0] is None else "left"]
+            if (target_edges[0] is None) != (target_edges[1] is None)
+            else ["right", "left"]
+        )
         remarks.append(f"no open {' and '.join(names)} eye was found on it, so that its lids stay at rest")
     else:
-        whole = Surface(correspondence.laid.vertices, correspondence.target_faces)
+        rest = Surface(correspondence.laid.vertices, correspondence.target_faces)
         face = Surface(correspondence.source_vertices, correspondence.source_faces)
         original = np.asarray(animation.vertices[blink], np.float64)
         gaps, passed, inside, expected = [], [], [], []
         for eye in (0, 1):
-            gap, hole = _still_seen(whole, posed, target, eye)
+            gap, hole = _still_seen(rest, posed, target, eye)
             gaps.append(gap)
             holes.append(hole)
             # Painted lids of the source may not shut either: what is left open there is no fault of the target.
             expected.append(_still_seen(face, original, source, eye)[0])
-            passed.append(_overshoot(new[eye], whole.vertices, posed))
-            inside.append(_inside_ball(whole, posed, target, eye))
+            passed.append(_overshoot(target_edges[eye], rest.vertices, posed))
+            inside.append(_inside_ball(rest, posed, target, eye))
         worst = int(np.argmax(np.subtract(gaps, expected)))
         if gaps[worst] > expected[worst] + LEFT_OPEN:
             faults.append(
@@ -120,12 +124,12 @@ def check_eyes(
         if abs(gaps[0] - gaps[1]) > abs(expected[0] - expected[1]) + UNEVEN:
             faults.append("one of its eyes shuts and the other does not")
     stretch, folded = _forehead(carried, correspondence.laid, target, source, frames, correspondence)
-    own_stretch, own_folded = _forehead(
+    source_stretch, source_folded = _forehead(
         animation, Surface(correspondence.source_vertices, correspondence.source_faces), source, source, frames, None
     )
-    if stretch > own_stretch + STRETCHED:
+    if stretch > source_stretch + STRETCHED:
         faults.append(f"its forehead is torn: edges grow or shrink by {stretch:.0%}")
-    if folded > own_folded + FOLDED:
+    if folded > source_folded + FOLDED:
         faults.append(f"its forehead folds: {folded:.1%} of the moving triangles turn over")
     figures = EyeFigures(
         lid_gap=None if gaps is None else max(gaps),
@@ -175,7 +179,7 @@ def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> tu
     opening = features.eyes[eye]
     assert opening is not None  # noqa: S101 - for type checkers
     ball = eyeball_triangles(rest, features, eye)
-    kept = np.union1d(ball, np.flatnonzero(features.skin[rest.faces[:, 0]]))
+    triangles = np.union1d(ball, np.flatnonzero(features.skin[rest.faces[:, 0]]))
     half = 0.7 * opening.width
     low, step = opening.centre[:2] - half, 2 * half / PIXELS
     x, y = np.meshgrid(low[0] + step * (np.arange(PIXELS) + 0.5), low[1] + step * (np.arange(PIXELS) + 0.5))
@@ -185,16 +189,19 @@ def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> tu
     inner = (y < top - margin) & (y > bottom + margin)
     if not inner.any():
         return 0.0, 0.0
-    shown = [Seen(points, rest.faces).raster(kept, low, step, PIXELS, PIXELS)[0] for points in (rest.vertices, posed)]
+    pictures = [
+        FrontView(points, rest.faces).raster(triangles, low, step, PIXELS, PIXELS)[0]
+        for points in (rest.vertices, posed)
+    ]
     inside = np.zeros(len(rest.faces) + 1, bool)
     inside[ball] = True
-    inside[shown[0][inner]] = True  # the socket; and -1, nothing, is the last one
+    inside[pictures[0][inner]] = True  # the socket; and -1, nothing, is the last one
     inside[-1] = True
     # What faces away is the inside of a lid, or of the head, that is seen past a torn one.
     inside[:-1] |= _face_normals(posed, rest.faces)[:, 2] < 0
-    share = float(inside[shown[1][inner]].mean())
+    share = float(inside[pictures[1][inner]].mean())
     opening_seen = (y < top) & (y > bottom)
-    columns = (inside[shown[1]] & opening_seen).sum(axis=0)
+    columns = (inside[pictures[1]] & opening_seen).sum(axis=0)
     # A hole is three columns wide at least: corners and single pixels at the edges of triangles are none.
     tallest = np.minimum(np.minimum(columns[:-2], columns[1:-1]), columns[2:]).max()
     return share, float(tallest / opening_seen.sum(axis=0).max())
@@ -224,19 +231,19 @@ def _inside_ball(rest: Surface, posed: Array, features: Features, eye: int) -> f
 def _forehead(
     animation: Animation,
     rest: Surface,
-    own: Features,
+    features: Features,
     source: Features,
     frames: npt.NDArray[np.integer],
     correspondence: Correspondence | None,
 ) -> tuple[float, float]:
     """How much edges of the forehead grow or shrink, and the share of its moving triangles that turn over."""
-    eyes = [mine or theirs for mine, theirs in zip(own.eyes, source.eyes, strict=True)]
+    eyes = [eye_here or fallback for eye_here, fallback in zip(features.eyes, source.eyes, strict=True)]
     openings = [eye for eye in eyes if eye is not None]
     width = float(np.mean([eye.width for eye in openings]))
     level = float(np.mean([eye.centre[1] for eye in openings]))
     points = rest.vertices
     # Above the eyes, between and beside them; the lids are looked at by themselves.
-    inside = own.skin & (points[:, 1] > level - 0.2 * width) & (points[:, 1] < level + FOREHEAD * width)
+    inside = features.skin & (points[:, 1] > level - 0.2 * width) & (points[:, 1] < level + FOREHEAD * width)
     middle = np.mean([eye.centre for eye in openings], axis=0)
     inside &= (np.abs(points[:, 0] - middle[0]) < 2.5 * width) & (points[:, 2] > middle[2] - 1.2 * width)
     for eye in openings:
@@ -248,10 +255,10 @@ def _forehead(
     if not len(faces):
         return 0.0, 0.0
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    long = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    lengths = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # Edges that decimation left almost without length say nothing.
-    pairs = pairs[long > 0.2 * np.median(long)]
-    long = long[long > 0.2 * np.median(long)]
+    pairs = pairs[lengths > 0.2 * np.median(lengths)]
+    lengths = lengths[lengths > 0.2 * np.median(lengths)]
     areas = np.linalg.norm(_face_normals(points, faces), axis=1)
     faces = faces[areas > 0.1 * np.median(areas)]
     normals = _face_normals(points, faces)
@@ -263,8 +270,8 @@ def _forehead(
         some = moves[pairs].any(axis=1)
         if not some.any():
             continue
-        now = np.linalg.norm(posed[pairs[some, 0]] - posed[pairs[some, 1]], axis=1)
-        change = np.abs(np.log(np.maximum(now, 1e-12) / long[some]))
+        posed_lengths = np.linalg.norm(posed[pairs[some, 0]] - posed[pairs[some, 1]], axis=1)
+        change = np.abs(np.log(np.maximum(posed_lengths, 1e-12) / lengths[some]))
         # An edge that halves counts as one that doubles. One of 200 may do what it likes: scans have slivers whose
         # length is noise.
         stretch = max(stretch, float(np.expm1(np.quantile(change, 0.995))))

@@ -1,7 +1,4 @@
-"""Where a face's eyelids and eyeballs are, and how the lids shut.
-
-They are known for the built-in puppet, and are read from the user's file for any other topology.
-"""
+"""Eyelids and eyeballs of a face, and how the lids shut: known for the built-in puppet, else from the user's file."""
 
 from __future__ import annotations
 
@@ -12,10 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import OptionError, damaged
 from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.numerics import smooth_step
 from facediff.utils.plain_files import load_json
+from facediff.utils.records import read_record
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -30,7 +28,7 @@ MEET = 0.12  # Where the lids meet, from the lower (0) to the upper edge (1): th
 AHEAD = 0.025
 """The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
 REACH = 0.4  # How far from the edges the skin follows, as a share of the eye's width
-KEYS = ("neutral", "blinks", "lids", "eyeballs", "brows")
+KEYS = "neutral", "blinks", "lids", "eyeballs", "brows"
 PLAUSIBLE = (0.002, 0.2)  # The largest way of a lid, as a share of the face's size (the diagonal of its box)
 SAME_FACE = 1e-3  # Metres that a face may differ from a puppet's to count as that puppet's
 
@@ -39,26 +37,19 @@ SAME_FACE = 1e-3  # Metres that a face may differ from a puppet's to count as th
 class Eyes:
     """The eyes of a face."""
 
-    # (V, 3) way from open to shut lids, in the face's unit; zero wherever a blink moves nothing. None if it is
-    # not known
+    # (V, 3) displacements from open to shut lids, in the face's unit; None if they are not known
     closing: npt.NDArray[np.float32] | None
     eyeballs: tuple[Indices, ...]  # vertices of each eyeball
-    source: str  # who says so, for messages
-    brows: Indices | None = None  # vertices of both brows; None if nobody says
-
-    def __post_init__(self) -> None:
-        if self.closing is not None and not (np.isfinite(self.closing).all() and self.closing.any()):
-            raise FaceDiffError(f"{self.source}: its blink moves nothing, or holds NaN; give the shape of shut eyes")
-        if any(len(ball) < 4 for ball in self.eyeballs):
-            raise FaceDiffError(f"{self.source}: an eyeball of less than four vertices has no centre; name all of them")
+    source: str  # for messages
+    brows: Indices | None = None  # vertices of both brows; None if they are not known
 
     def lids(self) -> tuple[Indices, npt.NDArray[np.float32]]:
         """The vertices (L,) that a blink moves, and their ways (L, 3); refused if the way is not known."""
         if self.closing is None:
             raise OptionError.naming(f"{self.source}: does not say how the lids shut; {GIVE}")
-        way = np.linalg.norm(self.closing, axis=-1)
-        chosen = np.flatnonzero(way > STILL * way.max())
-        return chosen, self.closing[chosen]
+        lengths = np.linalg.norm(self.closing, axis=-1)
+        vertices = np.flatnonzero(lengths > STILL * lengths.max())
+        return vertices, self.closing[vertices]
 
 
 def eyes_for(template: Vertices, faces: npt.NDArray[np.integer] | None, file: Path | None) -> Eyes | None:
@@ -67,7 +58,7 @@ def eyes_for(template: Vertices, faces: npt.NDArray[np.integer] | None, file: Pa
 
 
 def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Eyes | None:
-    """The eyes of a face (V, 3) of the built-in corpus, by the rig that its blinks are made with; None for others."""
+    """The eyes of a face (V, 3) of the built-in corpus, by the rig of its blinks; None for other faces."""
     from facediff.synthetic.known_faces import known_face
 
     face = known_face(template, faces)
@@ -95,7 +86,7 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
     if path.suffix.lower() == ".npz":
         arrays = read_arrays(path, name=f"eyes {path}")
         names = sorted(name for name in arrays if name.startswith("eyeball"))
-        balls = tuple(_checked(path, arrays[name], len(template)) for name in names)
+        balls = tuple(_checked(path, arrays[name], len(template), 4) for name in names)
         closing, neutral = arrays.get("closing"), arrays.get("neutral")
         brows = _checked(path, arrays["brows"], len(template)) if "brows" in arrays else None
     else:
@@ -107,14 +98,14 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
     if closing is None:
         return Eyes(None, balls, f"eyes {path}", brows)
     size = float(np.linalg.norm(np.ptp(template, axis=0)))
-    if closing.shape != template.shape or (neutral is not None and neutral.shape != template.shape):
-        raise OptionError.naming(f"{{eyes}} {path}: its blink has shape {closing.shape}; the face has {template.shape}")
     scale = 1.0 if neutral is None else size / max(float(np.linalg.norm(np.ptp(neutral, axis=0))), 1e-12)
-    way = scale * float(np.linalg.norm(closing, axis=-1).max())
-    if not PLAUSIBLE[0] * size < way < PLAUSIBLE[1] * size:
+    longest = scale * float(np.linalg.norm(closing, axis=-1).max())
+    same_mesh = closing.shape == template.shape and (neutral is None or neutral.shape == template.shape)
+    if not same_mesh or not PLAUSIBLE[0] * size < longest < PLAUSIBLE[1] * size:
         raise OptionError.naming(
-            f"{{eyes}} {path}: its blink moves a lid by {way:.3g} on a face of size {size:.3g}; give the shape of shut "
-            f'eyes, and as "neutral" the open face in the same unit'
+            f"{{eyes}} {path}: its blink has shape {closing.shape} and moves a lid by {longest:.3g}, on a face of "
+            f'shape {template.shape} and size {size:.3g}; give the shape of shut eyes, and as "neutral" the open face '
+            f"in the same unit"
         )
     return Eyes(np.asarray(scale * closing, np.float32), balls, f"eyes {path}", brows)
 
@@ -122,39 +113,43 @@ def read_eyes(path: Path, template: Vertices) -> Eyes:
 def _read_json(
     path: Path, template: Vertices
 ) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...], Indices | None]:
-    """How the lids shut, by shapes or by edges; the open face; eyeballs; brows. None where the file does not say."""
-    content = load_json(path, name=f"eyes {path}")
-    lids_fit = isinstance(content, dict) and all(
-        isinstance(lid, dict) and {"upper", "lower"} <= lid.keys() for lid in content.get("lids", [])
-    )
-    if not lids_fit or not content.keys() <= set(KEYS):
-        raise OptionError.naming(
-            f"{{eyes}} {path}: expected an object with {', '.join(KEYS)} alone, all but the first of them lists, and "
-            f'"lids" of {{"upper": …, "lower": …}}'
-        )
+    """Closing of the lids by shapes or edges; the open face; eyeballs; brows. None where the file states none."""
+    record = read_record(_EyesFile, load_json(path, name=f"eyes {path}"), f"eyes {path}")
     count = len(template)
-    balls = tuple(_indices(path, listed, count) for listed in content.get("eyeballs", []))
-    neutral = _read_shape(path, content["neutral"]) if "neutral" in content else None
+    balls = tuple(_indices(path, entry, count, 4) for entry in record.eyeballs)
+    neutral = _read_shape(path, record.neutral) if record.neutral else None
     brows = None
-    if listed := content.get("brows"):
-        entries = listed if any(isinstance(entry, str | list) for entry in listed) else [listed]
+    if record.brows:
+        entries = record.brows if any(isinstance(entry, str | list) for entry in record.brows) else [list(record.brows)]
         brows = np.unique(np.concatenate([_indices(path, entry, count) for entry in entries]))
-    if content.get("blinks"):
+    if record.blinks:
         total: Vertices = np.zeros((count, 3))
-        for name in content["blinks"]:
-            shape = _read_shape(path, name)
-            absolute = Path(name).suffix.lower() != ".npy"
-            if len(shape) != count or (absolute and (neutral is None or len(neutral) != count)):
-                raise OptionError.naming(
-                    f'{{eyes}} {path}: "{name}" has {len(shape)} vertices and the face {count}; give the open face of '
-                    f'the same mesh as "neutral"'
-                )
-            total = total + (shape - neutral if absolute and neutral is not None else shape)
+        with damaged(f"eyes {path}", 'give shapes of this face, and the open face of the same mesh as "neutral"'):
+            for name in record.blinks:
+                shape = _read_shape(path, name)
+                total = total + (shape if Path(name).suffix.lower() == ".npy" else np.subtract(shape, neutral))
         return total, neutral, balls, brows
-    if content.get("lids"):
-        edges = [(_indices(path, lid["upper"], count), _indices(path, lid["lower"], count)) for lid in content["lids"]]
+    if record.lids:
+        edges = [(_indices(path, lid.upper, count, 2), _indices(path, lid.lower, count, 2)) for lid in record.lids]
         return closing_of_lids(template, edges, np.concatenate(balls) if balls else None), neutral, balls, brows
     return None, neutral, balls, brows
+
+
+@dataclass(frozen=True)
+class _LidEdges:
+    upper: Any
+    lower: Any
+
+
+@dataclass(frozen=True)
+class _EyesFile:
+    """The content of a .json file of eyes."""
+
+    neutral: str | None = None
+    blinks: tuple[str, ...] = ()
+    lids: tuple[_LidEdges, ...] = ()
+    eyeballs: tuple[Any, ...] = ()
+    brows: tuple[Any, ...] = ()
 
 
 def _read_shape(path: Path, name: str) -> Vertices:
@@ -168,25 +163,26 @@ def _read_shape(path: Path, name: str) -> Vertices:
     return np.asarray(array.reshape(-1, 3), np.float64)
 
 
-def _indices(path: Path, listed: object, n_vertices: int) -> Indices:
+def _indices(path: Path, entry: object, n_vertices: int, least: int = 1) -> Indices:
     """Indices in their order: a list of them, a text file, or a mask of a pickle (``FLAME_masks.pkl:left_eyeball``)."""
     from facediff.mesh.flame import read_masks
     from facediff.metrics.regions import read_indices
 
-    try:
-        if not isinstance(listed, str):
-            return _checked(path, np.asarray(listed), n_vertices)
-        file, _, mask = listed.partition(":") if ".pkl:" in listed else (listed, "", "")
-        read = read_masks(path.parent / file, mask) if file.endswith(".pkl") else read_indices(path.parent / file)
-    except ValueError as error:
-        raise OptionError.naming(f"{{eyes}} {path}: {error}") from error
-    return _checked(path, np.asarray(read), n_vertices)
+    with damaged(f"eyes {path}", "expected lists of vertex indices"):
+        if not isinstance(entry, str):
+            return _checked(path, np.asarray(entry), n_vertices, least)
+        file, _, mask = entry.partition(":") if ".pkl:" in entry else (entry, "", "")
+        indices = read_masks(path.parent / file, mask) if file.endswith(".pkl") else read_indices(path.parent / file)
+        return _checked(path, np.asarray(indices), n_vertices, least)
 
 
-def _checked(path: Path, indices: npt.NDArray[Any], n_vertices: int) -> Indices:
-    fit = indices.ndim == 1 and len(indices) and np.issubdtype(indices.dtype, np.integer)
-    if not fit or not 0 <= indices.min() <= indices.max() < n_vertices:
-        raise OptionError.naming(f"{{eyes}} {path}: expected lists of vertex indices from 0 to {n_vertices - 1}")
+def _checked(path: Path, indices: npt.NDArray[Any], n_vertices: int, least: int = 1) -> Indices:
+    is_list = indices.ndim == 1 and len(indices) >= least and np.issubdtype(indices.dtype, np.integer)
+    if not is_list or not 0 <= indices.min() <= indices.max() < n_vertices:
+        raise OptionError.naming(
+            f"{{eyes}} {path}: expected lists of vertex indices from 0 to {n_vertices - 1}: at least 4 of an eyeball, "
+            f"2 of a lid's edge"
+        )
     return indices.astype(np.int64)
 
 
@@ -199,21 +195,19 @@ def closing_of_lids(
     between them at its own share of the way along; the skin around follows its nearest edge vertices, less and less up
     to 0.4 of the eye's width away. ``rigid`` vertices (eyeballs) do not follow.
     """
-    places = np.asarray(template, np.float64)
-    closing = np.zeros_like(places)
+    points = np.asarray(template, np.float64)
+    closing = np.zeros_like(points)
     for upper, lower in lids:
-        top, bottom = places[upper], places[lower]
+        top, bottom = points[upper], points[lower]
         # Edges may be listed from either corner of the eye: the lower one is made to begin where the upper one does.
         if np.linalg.norm(top[0] - bottom[0]) > np.linalg.norm(top[0] - bottom[-1]):
             lower, bottom = lower[::-1], bottom[::-1]
         width = max(float(np.linalg.norm(np.ptp(edge, axis=0))) for edge in (top, bottom))
-        if min(len(top), len(bottom)) < 2 or width <= 0:
-            raise FaceDiffError("lids: an edge needs two vertices at least, from one corner of the eye to the other")
         edge = np.concatenate([upper, lower])
         way = np.concatenate([(1.0 - MEET) * _ways(top, bottom), MEET * _ways(bottom, top)])
         # The straight way between the edges would lead through the eyeball, which bulges most in the middle.
         way[:, 2] += AHEAD * width * np.concatenate([_arch(top), 0.5 * _arch(bottom)])
-        distance = np.linalg.norm(places[:, None] - places[edge], axis=-1)
+        distance = np.linalg.norm(points[:, None] - points[edge], axis=-1)
         near = np.flatnonzero(distance.min(axis=1) < REACH * width)
         share = 1.0 - smooth_step(distance[near].min(axis=1) / (REACH * width))
         # Inverse distances to the fourth power: at an edge vertex its own way alone, in between a blend.
@@ -233,10 +227,10 @@ def _along(edge: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps)]) / max(float(steps.sum()), 1e-12)
 
 
-def _ways(edge: Array, other: Array) -> Array:
-    """From each vertex of an edge (N, 3) to the other edge, at the same share of the way along."""
-    at, knots = _along(edge), _along(other)
-    return np.stack([np.interp(at, knots, other[:, axis]) for axis in range(3)], axis=1) - edge
+def _ways(edge: Array, opposite: Array) -> Array:
+    """From each vertex of an edge (N, 3) to the opposite edge, at the same share of the way along."""
+    at, knots = _along(edge), _along(opposite)
+    return np.stack([np.interp(at, knots, opposite[:, axis]) for axis in range(3)], axis=1) - edge
 
 
 def _arch(edge: Array) -> Array:

@@ -71,9 +71,9 @@ class Features:
             (self.mouth.upper, self.mouth.upper_seeds, UPPER_LIP),
             (self.mouth.lower, self.mouth.lower_seeds, LOWER_LIP),
         ):
-            own = seeds[self.codes[seeds] == code]
-            own = own if len(own) else seeds
-            sides.append((own, np.linalg.norm(vertices[own][None] - curve[at][:, None], axis=2)))
+            lip = seeds[self.codes[seeds] == code]
+            lip = lip if len(lip) else seeds
+            sides.append((lip, np.linalg.norm(vertices[lip][None] - curve[at][:, None], axis=2)))
         (upper, above), (lower, below) = sides
         return np.array([facing(vertices, upper, one, lower, two) for one, two in zip(above, below, strict=True)])
 
@@ -104,7 +104,7 @@ class SearchWindow:
     expected: float
 
 
-class Seen:
+class FrontView:
     """A mesh as it is seen from the front.
 
     Args:
@@ -144,11 +144,11 @@ class Seen:
         loops = connected_components(joined, directed=False)[1][rim]
         for name in np.flatnonzero(np.bincount(loops) >= 6):
             loop = rim[loops == name]
-            places, counts = np.unique(welded[loop], return_counts=True)
+            positions, counts = np.unique(welded[loop], return_counts=True)
             paired = np.count_nonzero(counts == 2)
             span = np.ptp(self.vertices[loop], axis=0)
             # Nearly all of its places occur twice, but for its two ends; and it is short and lies across.
-            if paired >= 2 and len(places) - paired <= 4 and span.max() < 0.4 * extent and span[0] > 2 * span[1]:
+            if paired >= 2 and len(positions) - paired <= 4 and span.max() < 0.4 * extent and span[0] > 2 * span[1]:
                 welded[loop] = loop
         return welded
 
@@ -169,35 +169,35 @@ class Seen:
         joined = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)), False)[1]
         return np.asarray(joined, np.int64)[self.welded]
 
-    def graph(self, kept: Indices) -> tuple[csr_array, Indices]:
+    def graph(self, triangles: Indices) -> tuple[csr_array, Indices]:
         """Lengths of edges between welded vertices of some triangles, and the row (V,) of each vertex; -1 for none."""
         from scipy.sparse import csr_array
 
-        corners = self.corners[kept]
-        used, place = np.unique(corners, return_inverse=True)
-        place = place.reshape(-1, 3)
-        both = np.concatenate([place[:, [0, 1]], place[:, [1, 2]], place[:, [2, 0]]])
-        both = np.unique(np.sort(both, axis=1), axis=0)
-        both = both[both[:, 0] != both[:, 1]]
-        lengths = np.linalg.norm(self.vertices[used[both[:, 0]]] - self.vertices[used[both[:, 1]]], axis=1)
+        corners = self.corners[triangles]
+        vertices, slots = np.unique(corners, return_inverse=True)
+        slots = slots.reshape(-1, 3)
+        edges = np.concatenate([slots[:, [0, 1]], slots[:, [1, 2]], slots[:, [2, 0]]])
+        edges = np.unique(np.sort(edges, axis=1), axis=0)
+        edges = edges[edges[:, 0] != edges[:, 1]]
+        lengths = np.linalg.norm(self.vertices[vertices[edges[:, 0]]] - self.vertices[vertices[edges[:, 1]]], axis=1)
         # SciPy's sparse graphs take an explicit zero for a missing edge; welded vertices lie at distance 0.
         lengths = np.maximum(lengths, 1e-12)
-        lengths_of_edges = csr_array((lengths, (both[:, 0], both[:, 1])), shape=(len(used),) * 2)
+        lengths_of_edges = csr_array((lengths, (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
         rows = np.full(len(self.vertices), -1)
-        rows[used] = np.arange(len(used))
+        rows[vertices] = np.arange(len(vertices))
         return lengths_of_edges, rows[self.welded]
 
     def raster(
-        self, kept: Indices, low: Array, step: float, columns: int, rows: int
+        self, triangles: Indices, low: Array, step: float, columns: int, rows: int
     ) -> tuple[Indices, Array, npt.NDArray[np.float64]]:
         """The first triangle that each pixel's ray along z meets: its number (R, C), -1 for none, depth and weights."""
-        points = self.vertices[self.faces[kept]]
+        points = self.vertices[self.faces[triangles]]
         flat = (points[:, :, :2] - low) / step
         first = np.clip(np.ceil(flat.min(axis=1) - 0.5).astype(int), 0, [columns, rows])
         last = np.clip(np.floor(flat.max(axis=1) - 0.5).astype(int) + 1, 0, [columns, rows])
         spans = np.maximum(last - first, 0)
         counts = spans[:, 0] * spans[:, 1]
-        which = np.repeat(np.arange(len(kept)), counts)
+        which = np.repeat(np.arange(len(triangles)), counts)
         inner = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
         width = np.maximum(spans[which, 0], 1)
         column, row = first[which, 0] + inner % width, first[which, 1] + inner // width
@@ -222,7 +222,7 @@ class Seen:
         number: Indices = np.full(rows * columns, -1, np.int64)
         deep: Array = np.full(rows * columns, -np.inf)
         share: Array = np.zeros((rows * columns, 3))
-        number[pixel[head]] = kept[which[best]]
+        number[pixel[head]] = triangles[which[best]]
         deep[pixel[head]] = depth[best]
         share[pixel[head]] = weights[best]
         return number.reshape(rows, columns), deep.reshape(rows, columns), share.reshape(rows, columns, 3)
@@ -230,10 +230,10 @@ class Seen:
     def within(self, low: Array, high: Array, skin: npt.NDArray[np.bool_] | None = None) -> Indices:
         """Triangles that reach into a rectangle of x and y."""
         flat = self.vertices[self.faces][:, :, :2]
-        kept = (flat.max(axis=1) >= low).all(axis=1) & (flat.min(axis=1) <= high).all(axis=1)
+        inside = (flat.max(axis=1) >= low).all(axis=1) & (flat.min(axis=1) <= high).all(axis=1)
         if skin is not None:
-            kept &= skin[self.faces[:, 0]]
-        return np.flatnonzero(kept)
+            inside &= skin[self.faces[:, 0]]
+        return np.flatnonzero(inside)
 
     def skin_at(self, window: SearchWindow) -> npt.NDArray[np.bool_] | None:
         """(V,) the piece that is the face's skin in a window; None where it shows nothing.
@@ -246,8 +246,8 @@ class Seen:
             return None
         candidates = counts[0][0][counts[0][1] > SHOWS * counts[0][1].sum()]
         names, pixels = counts[1]
-        known = np.isin(names, candidates)
-        return np.asarray(self.pieces == names[known][pixels[known].argmax()])
+        is_candidate = np.isin(names, candidates)
+        return np.asarray(self.pieces == names[is_candidate][pixels[is_candidate].argmax()])
 
     def _shown(self, window: SearchWindow, grown: float) -> tuple[Indices, Indices]:
         """Labels of the pieces in a window, which grows mostly upwards, and how many pixels each has."""
@@ -255,8 +255,8 @@ class Seen:
         high = np.array([window.x + grown * window.half_width, window.y + (2 * grown - 1) * window.half_height])
         step = grown * window.half_width / 32
         number, _, _ = self.raster(self.within(low, high), low, step, 64, max(2, int((high - low)[1] / step)))
-        seen = number[number >= 0]
-        names, counts = np.unique(self.pieces[self.faces[seen, 0]], return_counts=True)
+        visible = number[number >= 0]
+        names, counts = np.unique(self.pieces[self.faces[visible, 0]], return_counts=True)
         return names, counts
 
     def opening(
@@ -277,10 +277,10 @@ class Seen:
         expected = window.expected
         step = expected / PIXELS
         columns, rows = int(2 * window.half_width / step), int(2 * window.half_height / step)
-        kept = self.within(low, high, skin)
-        if not len(kept):
+        triangles = self.within(low, high, skin)
+        if not len(triangles):
             return None
-        number, depth, weights = self.raster(kept, low, step, columns, rows)
+        number, depth, weights = self.raster(triangles, low, step, columns, rows)
         number, depth, weights = number[::-1], depth[::-1], weights[::-1]  # from the top down
         # An odd height keeps the closing centred on its pixel.
         tall = max(3, int(highest * expected / step) | 1)
@@ -302,18 +302,18 @@ class Seen:
         first, second = (self._points(number, weights, pairs[:, [k, 2]]) for k in (0, 1))
         straight = np.linalg.norm(first - second, axis=1)
         margin = 0.6 * expected
-        graph, place = self.graph(self.within(low - margin, high + margin, skin))
+        graph, rows_of = self.graph(self.within(low - margin, high + margin, skin))
         # On whole skin the way along the surface is hardly longer than the straight line; across an opening it leads
         # round one of the corners. The share of the width keeps bumps from counting as openings.
         limit = FARTHER * straight + PARTED * expected
-        parted = self._ways_between(graph, place, (first, second), (a, b), limit) > limit
+        parted = self._ways_between(graph, rows_of, (first, second), (a, b), limit) > limit
         # What is seen through a hole lies behind its rims, and the way round the hole may be short.
         parted |= pairs[:, 1] - pairs[:, 0] > max(2, HOLE * PIXELS)
         pairs, above, below, first, second = (part[parted] for part in (pairs, above, below, first, second))
-        chosen = _widest(pairs, columns, window, step, low)
-        if chosen is None:
+        selection = _widest(pairs, columns, window, step, low)
+        if selection is None:
             return None
-        return self._opening(pairs[chosen], first[chosen], second[chosen], above[chosen], below[chosen])
+        return self._opening(pairs[selection], first[selection], second[selection], above[selection], below[selection])
 
     def _points(self, number: Indices, weights: Array, at: Indices) -> Array:
         corners = self.vertices[self.faces[number[at[:, 0], at[:, 1]]]]
@@ -322,7 +322,7 @@ class Seen:
     def _ways_between(
         self,
         graph: csr_array,
-        place: Indices,
+        rows_of: Indices,
         points: tuple[Array, Array],
         corners: tuple[Indices, Indices],
         limit: Array,
@@ -331,10 +331,10 @@ class Seen:
         from scipy.sparse.csgraph import dijkstra
 
         offsets = [
-            np.linalg.norm(self.vertices[some] - there[:, None], axis=2)
-            for there, some in zip(points, corners, strict=True)
+            np.linalg.norm(self.vertices[some] - point[:, None], axis=2)
+            for point, some in zip(points, corners, strict=True)
         ]
-        starts, row = np.unique(place[corners[0]], return_inverse=True)
+        starts, row = np.unique(rows_of[corners[0]], return_inverse=True)
         row = row.reshape(-1, 3)
         shortest = np.full(len(limit), np.inf)
         # In batches: all starts at a time would need a distance for every pair of a start and a vertex.
@@ -343,9 +343,11 @@ class Seen:
             some = np.flatnonzero(inside.any(axis=1))
             ways = dijkstra(graph, directed=False, indices=starts[begin : begin + 256], limit=float(limit[some].max()))
             for i in range(3):
-                own = some[inside[some, i]]
-                between = ways[(row[own, i] - begin)[:, None], place[corners[1][own]]]
-                shortest[own] = np.minimum(shortest[own], offsets[0][own, i] + (between + offsets[1][own]).min(axis=1))
+                members = some[inside[some, i]]
+                between = ways[(row[members, i] - begin)[:, None], rows_of[corners[1][members]]]
+                shortest[members] = np.minimum(
+                    shortest[members], offsets[0][members, i] + (between + offsets[1][members]).min(axis=1)
+                )
         return shortest
 
     def _opening(self, pairs: Indices, first: Array, second: Array, above: Indices, below: Indices) -> Opening | None:
@@ -363,11 +365,11 @@ class Seen:
         """Lengths (V,) of the ways along the surface to the upper and to the lower side; infinite beyond a limit."""
         margin = limit + opening.width
         middle = opening.centre[:2]
-        graph, place = self.graph(self.within(middle - margin, middle + margin))
+        graph, rows_of = self.graph(self.within(middle - margin, middle + margin))
         ways = []
         for side, seeds in ((opening.upper, opening.upper_seeds), (opening.lower, opening.lower_seeds)):
-            way = _ways_from(graph, place[seeds], _away(self.vertices[seeds], side), limit)
-            ways.append(np.where(place >= 0, way[np.maximum(place, 0)], np.inf))
+            way = _ways_from(graph, rows_of[seeds], _away(self.vertices[seeds], side), limit)
+            ways.append(np.where(rows_of >= 0, way[np.maximum(rows_of, 0)], np.inf))
         return ways[0], ways[1]
 
     def completed(self, opening: Opening, expected: float) -> Opening:
@@ -375,14 +377,14 @@ class Seen:
         limit = 0.6 * max(opening.width, expected)
         worst = np.maximum(*self._ways(opening, limit))
         ends = [np.array([], float).reshape(0, 3)] * 2
-        for k, (sign, place) in enumerate(((-1, 0), (1, -1))):
-            tips = np.stack([opening.upper[place], opening.lower[place]])
+        for k, (sign, end) in enumerate(((-1, 0), (1, -1))):
+            tips = np.stack([opening.upper[end], opening.lower[end]])
             outside = sign * (self.vertices[:, 0] - (sign * tips[:, 0]).max() * sign) > 0
             outside &= np.isfinite(worst)
             if outside.any():
                 # The inside of a corner is as far from both sides; the corner itself is what lies in front.
-                far = np.where(outside, worst + 0.5 * np.abs(self.vertices[:, 2] - tips[:, 2].mean()), np.inf)
-                ends[k] = self.vertices[[far.argmin()]]
+                distances = np.where(outside, worst + 0.5 * np.abs(self.vertices[:, 2] - tips[:, 2].mean()), np.inf)
+                ends[k] = self.vertices[[distances.argmin()]]
         upper, lower = (_resampled(np.concatenate([ends[0], side, ends[1]])) for side in (opening.upper, opening.lower))
         return Opening(upper, lower, opening.upper_seeds, opening.lower_seeds)
 
@@ -399,9 +401,9 @@ class Seen:
             with np.errstate(invalid="ignore"):
                 # Beyond the corners, and at the back of the mouth, both are about equally far.
                 sure = ~(np.abs(up - down) <= UNSURE[0] * opening.width + UNSURE[1] * nearest)
-            own = (nearest < limit) & (nearest < least) & sure
-            codes[own] = np.where(up[own] < down[own], 1, 2) + 2 * index
-            least[own] = nearest[own]
+            members = (nearest < limit) & (nearest < least) & sure
+            codes[members] = np.where(up[members] < down[members], 1, 2) + 2 * index
+            least[members] = nearest[members]
         return codes
 
 
@@ -450,7 +452,7 @@ def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low
     labels = connected_components(coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(count,) * 2), False)[
         1
     ]
-    best, most = None, 0.0
+    best, best_worth = None, 0.0
     for name in np.unique(labels):
         some = np.flatnonzero(labels == name)
         wide = len(np.unique(pairs[some, 2])) * step / window.expected
@@ -460,8 +462,8 @@ def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low
         # Width counts up to 1.3 of what is expected, so that a wide gap elsewhere does not beat the mouth in the
         # middle.
         worth = min(wide, 1.3) - 1.0 * abs(centre - window.x) / window.expected
-        if worth > most:
-            best, most = some, worth
+        if worth > best_worth:
+            best, best_worth = some, worth
     return best
 
 
@@ -500,8 +502,8 @@ def _ways_from(graph: csr_array, starts: Indices, offsets: Array, limit: float) 
     np.minimum.at(least, starts, np.maximum(offsets, 1e-12))
     names = np.flatnonzero(np.isfinite(least))
     row = csr_array((least[names], (np.zeros(len(names), np.int64), names)), shape=(1, count))
-    whole = vstack([hstack([graph, csr_array((count, 1))]), hstack([row, csr_array((1, 1))])]).tocsr()
-    return np.asarray(dijkstra(whole, directed=False, indices=count, limit=limit)[:count])
+    extended = vstack([hstack([graph, csr_array((count, 1))]), hstack([row, csr_array((1, 1))])]).tocsr()
+    return np.asarray(dijkstra(extended, directed=False, indices=count, limit=limit)[:count])
 
 
 MOUTH_REACH, EYE_REACH = 0.8, 0.5
@@ -521,10 +523,10 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
         faces: (F, 3).
         expected: features of a face that lies in the same place, or its mouth; searched for everywhere if None.
     """
-    seen = Seen(vertices, faces)
+    view = FrontView(vertices, faces)
     expected_mouth = expected.mouth if isinstance(expected, Features) else expected
     if expected_mouth is None:
-        expected_mouth = _anywhere(seen)
+        expected_mouth = _anywhere(view)
         if expected_mouth is None:
             return None
     width = expected_mouth.width
@@ -534,13 +536,13 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
     # nostrils.
     for grown in (1.0, 1.6):
         window = SearchWindow(x, y, 1.1 * width * grown, 0.55 * width * grown, width)
-        skin = seen.skin_at(window)
-        mouth = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
+        skin = view.skin_at(window)
+        mouth = None if skin is None else view.opening(window, skin, *OPEN_MOUTH)
         if mouth is not None:
             break
     if mouth is None or skin is None:
         return None
-    mouth = seen.completed(mouth, width)
+    mouth = view.completed(mouth, width)
     if isinstance(expected, Features):
         away = np.abs(mouth.centre - expected_mouth.centre)[:2] / width
         if (away > ASIDE).any():
@@ -549,11 +551,11 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
     x, y, _ = mouth.centre
     eyes: list[Opening | None] = []
     for side in (0, 1):
-        place = expected.eyes[side] if isinstance(expected, Features) else None
-        if isinstance(expected, Features) and place is None:
+        expected_eye = expected.eyes[side] if isinstance(expected, Features) else None
+        if isinstance(expected, Features) and expected_eye is None:
             eyes.append(None)
             continue
-        if place is None:
+        if expected_eye is None:
             # Proportions of an average face in widths of its mouth; the window leaves room for others.
             sign = 2 * side - 1
             windows = [SearchWindow(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)]
@@ -561,29 +563,29 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
             # A longer or shorter face has its eyes elsewhere: the larger window comes second, as for the mouth.
             windows = [
                 SearchWindow(
-                    place.centre[0],
-                    place.centre[1],
-                    0.85 * grown * place.width,
-                    0.75 * grown * place.width,
-                    place.width,
+                    expected_eye.centre[0],
+                    expected_eye.centre[1],
+                    0.85 * grown * expected_eye.width,
+                    0.75 * grown * expected_eye.width,
+                    expected_eye.width,
                 )
                 for grown in (1.0, 1.6)
             ]
-        eye = next((eye for window in windows if (eye := seen.opening(window, skin, *OPEN_EYE)) is not None), None)
-        eyes.append(None if eye is None else seen.completed(eye, windows[0].expected))
-    codes = seen.codes([mouth, *eyes], (MOUTH_REACH, EYE_REACH, EYE_REACH))
+        eye = next((eye for window in windows if (eye := view.opening(window, skin, *OPEN_EYE)) is not None), None)
+        eyes.append(None if eye is None else view.completed(eye, windows[0].expected))
+    codes = view.codes([mouth, *eyes], (MOUTH_REACH, EYE_REACH, EYE_REACH))
     return Features(mouth, (eyes[0], eyes[1]), skin, codes)
 
 
-def _anywhere(seen: Seen) -> Opening | None:
+def _anywhere(view: FrontView) -> Opening | None:
     """The widest opening about the middle of the lower part of what is seen."""
-    used = seen.vertices[np.unique(seen.faces)]
-    low, high = used.min(axis=0), used.max(axis=0)
+    points = view.vertices[np.unique(view.faces)]
+    low, high = points.min(axis=0), points.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     window = SearchWindow(middle[0], middle[1], half[0], half[1], 0.3 * float(min(2 * half[0], 2 * half[1])))
-    skin = seen.skin_at(window)
-    mouth = None if skin is None else seen.opening(window, skin, *OPEN_MOUTH)
-    return None if mouth is None else seen.completed(mouth, window.expected)
+    skin = view.skin_at(window)
+    mouth = None if skin is None else view.opening(window, skin, *OPEN_MOUTH)
+    return None if mouth is None else view.completed(mouth, window.expected)
 
 
 def sides_of_pairs(vertices: Array, faces: Indices, pairs: Indices) -> Array:
@@ -591,16 +593,16 @@ def sides_of_pairs(vertices: Array, faces: Indices, pairs: Indices) -> Array:
 
     The lips may touch; what counts is the way along the surface.
     """
-    seen = Seen(vertices, faces)
+    view = FrontView(vertices, faces)
     points = vertices[pairs.ravel(), :2]
     margin = float(np.ptp(points, axis=0).max())
-    graph, place = seen.graph(seen.within(points.min(axis=0) - margin, points.max(axis=0) + margin))
+    graph, rows = view.graph(view.within(points.min(axis=0) - margin, points.max(axis=0) + margin))
     ways = []
     for column in (0, 1):
-        starts = place[pairs[:, column]]
+        starts = rows[pairs[:, column]]
         starts = starts[starts >= 0]
         if not len(starts):
             return np.zeros(len(vertices))
         way = _ways_from(graph, starts, np.zeros(len(starts)), 3 * margin)
-        ways.append(np.where(place >= 0, way[np.maximum(place, 0)], np.inf))
+        ways.append(np.where(rows >= 0, way[np.maximum(rows, 0)], np.inf))
     return np.where(ways[0] < ways[1], 1.0, np.where(ways[1] < ways[0], -1.0, 0.0))

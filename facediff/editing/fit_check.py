@@ -100,8 +100,8 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
     source, target = correspondence.features
     if source is not None:
         pairs = source.lips(correspondence.source_vertices, LIPS)
-        own = _gaps(np.stack([animation.template, *animation.vertices]), pairs)
-        mean = own.mean(axis=1)
+        source_gaps = _gaps(np.stack([animation.template, *animation.vertices]), pairs)
+        mean = source_gaps.mean(axis=1)
         widest = int(mean[1:].argmax())
         # Lips that are glued or torn show most where the mouth is widest.
         frames = np.unique(np.append(frames, widest))
@@ -117,7 +117,7 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
                 facing = target.lips(laid, LIPS)
                 gaps = _gaps(np.stack([carried.template, carried.vertices[widest]]), facing)
                 lip_ratio = float(gaps[0].mean() / max(gaps.mean(axis=1).max(), 1e-12))
-                opened = _opened(gaps[1] - gaps[0], scale * (own[1 + widest] - own[0]))
+                opened = _opened(gaps[1] - gaps[0], scale * (source_gaps[1 + widest] - source_gaps[0]))
                 torn = _torn(
                     animation,
                     carried,
@@ -160,9 +160,9 @@ def telling_frames(animation: Animation, correspondence: Correspondence) -> dict
     gaps = _gaps(animation.vertices, source.lips(correspondence.source_vertices, LIPS)).mean(axis=1)
     frames = {"widest mouth": int(gaps.argmax())}
     edges = [lid_edges(correspondence.source_vertices, source, eye) for eye in (0, 1)]
-    shown = [one for one in edges if one is not None]
-    if shown:
-        frames["full blink"] = fullest_blink(animation, shown)[0]
+    lids = [one for one in edges if one is not None]
+    if lids:
+        frames["full blink"] = fullest_blink(animation, lids)[0]
     brows = raised_brows(animation, source)
     return frames if brows is None else {**frames, "raised brows": brows}
 
@@ -200,9 +200,9 @@ def _torn(
     opening: float,
 ) -> float:
     """Share of the lips' edges whose motion differs by half of the mouth's opening from what is expected there."""
-    own = (np.float64(animation.vertices[frame][pairs]) - animation.template[pairs]) @ matrix.T
-    new = np.float64(carried.vertices[frame][facing]) - carried.template[facing]
-    return float(np.mean(np.linalg.norm(new - own, axis=2) > 0.5 * opening))
+    expected = (np.float64(animation.vertices[frame][pairs]) - animation.template[pairs]) @ matrix.T
+    moved = np.float64(carried.vertices[frame][facing]) - carried.template[facing]
+    return float(np.mean(np.linalg.norm(moved - expected, axis=2) > 0.5 * opening))
 
 
 def _gaps(frames: npt.NDArray[np.floating], pairs: npt.NDArray[np.integer]) -> Array:
@@ -226,11 +226,11 @@ def _crossed(
         moved = np.float64(one.vertices[frames][:, which[:, 0]]) - one.vertices[frames][:, which[:, 1]]
         return moved @ axis, np.minimum(rest @ axis, 0.0)
 
-    own, own_rest = heights(animation, pairs, np.array([0.0, 1.0, 0.0]))
-    new, new_rest = heights(carried, facing, up)
+    source_heights, source_rest = heights(animation, pairs, np.array([0.0, 1.0, 0.0]))
+    heights_now, rest_now = heights(carried, facing, up)
     # Closed lips touch, and rounding puts some a little past one another: a millimetre is not yet a fault.
     slack = 0.001 / metres_per_unit(animation.unit)
-    return float(((new < new_rest - scale * slack) & (own > own_rest - 0.5 * slack)).mean())
+    return float(((heights_now < rest_now - scale * slack) & (source_heights > source_rest - 0.5 * slack)).mean())
 
 
 def _folded(animation: Animation, faces: npt.NDArray[np.integer], frames: npt.NDArray[np.integer]) -> float:

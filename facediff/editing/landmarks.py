@@ -1,7 +1,7 @@
-"""Named places of a face: of known topologies by their vertices, of other meshes by their shape, and pairs on disk.
+"""Landmarks of a face: of known topologies by their vertices, of other meshes by their shape, and pairs on disk.
 
-One set of names serves every mesh: "left" is the face's own left. Landmarks are places of a surface, a vertex or a
-point within a triangle, and a pair says where one place is on the source and on the target.
+One set of names serves every mesh: "left" is the face's own left. A landmark is a vertex or a point within a triangle;
+a pair is the same landmark on the source and on the target.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,9 @@ import numpy.typing as npt
 from facediff.editing.face_features import Features, Opening, find_features
 from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
-from facediff.utils.limits import check_format
+from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import load_json, read_table, write_json
+from facediff.utils.records import Text, read_record
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -68,7 +69,7 @@ the one that reaches furthest forward below the mouth, and the one at the height
 that template left and right are mirror images of one another, and the others lie in its middle.
 
 No list was found for BIWI (23370 vertices), and Multiface's authors say that there is none for theirs
-(github.com/facebookresearch/multiface, issue 21): of these meshes, :func:`landmarks_by_shape` finds what it can.
+(github.com/facebookresearch/multiface, issue 21): :func:`landmarks_by_shape` finds some of theirs.
 """
 
 
@@ -105,7 +106,7 @@ def puppet_landmarks() -> dict[str, int]:
 
 
 @dataclass(frozen=True)
-class Known:
+class LandmarkTemplate:
     """The named places of a mesh.
 
     Attributes:
@@ -122,12 +123,11 @@ class Known:
         return [name for name in NAMES if name not in self.vertices]
 
 
-def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Known:
-    """The named places of a mesh: those of its topology, or those that its shape shows.
+def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> LandmarkTemplate:
+    """The named landmarks of a mesh, by its topology or by its shape.
 
-    A topology is recognised by the number of its vertices, and by its landmarks: left and right must lie as mirror
-    images of one another do, and the others between them, so that a mesh whose vertices were reordered is not taken
-    for one whose were not.
+    A topology is recognised by the number of its vertices, and by its landmarks: left and right must be mirror images,
+    with the others between them, so that a mesh with reordered vertices is not mistaken for the original.
 
     Args:
         vertices: (V, 3); where the topology is not known, y up and z to the viewer, as animations are.
@@ -141,10 +141,10 @@ def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.in
     by_topology = known_topology(vertices)
     if by_topology is not None:
         return by_topology
-    return Known(None, landmarks_by_shape(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)))
+    return LandmarkTemplate(None, landmarks_by_shape(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)))
 
 
-def known_topology(vertices: npt.NDArray[np.floating]) -> Known | None:
+def known_topology(vertices: npt.NDArray[np.floating]) -> LandmarkTemplate | None:
     """The named places of a mesh of a known topology; None of another one."""
     points = np.asarray(vertices, np.float64)
     for topology, count, table in (
@@ -152,7 +152,7 @@ def known_topology(vertices: npt.NDArray[np.floating]) -> Known | None:
         ("FLAME", FLAME_VERTICES, FLAME.copy),
     ):
         if len(points) == count and _lie_as_on_a_face(points, landmarks := table()):
-            return Known(topology, landmarks)
+            return LandmarkTemplate(topology, landmarks)
     return None
 
 
@@ -161,7 +161,7 @@ MIDDLE = 0.12  # So far from the middle, as a share of the distance of the eyes,
 
 
 def _lie_as_on_a_face(points: Array, landmarks: Mapping[str, int]) -> bool:
-    """Whether the places of all names lie as they do on a face, in whatever unit and orientation."""
+    """Whether the landmarks lie as they do on a face, in any unit and orientation."""
     at = {name: points[vertex] for name, vertex in landmarks.items()}
     bases = [name.removesuffix(LEFT) for name in landmarks if name.endswith(LEFT)]
     across = np.stack([at[base + LEFT] - at[base + RIGHT] for base in bases])
@@ -239,14 +239,14 @@ def _end(opening: Opening, end: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class SurfacePoints:
     """L places of a surface: corners (L, 3) of triangles and their weights (L, 3), of a vertex 1, 0 and 0."""
 
     corners: Indices
     weights: Array
 
     @classmethod
-    def of_vertices(cls, indices: npt.NDArray[np.integer]) -> Places:
+    def of_vertices(cls, indices: npt.NDArray[np.integer]) -> SurfacePoints:
         """The places of vertices (L,)."""
         corners = np.repeat(np.asarray(indices, np.int64).reshape(-1, 1), 3, axis=1)
         return cls(corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
@@ -261,14 +261,18 @@ class Landmarks:
     """L pairs of places that are the same on a source and on a target."""
 
     names: tuple[str, ...]  # of each pair; empty where it has none
-    source: Places
-    target: Places
+    source: SurfacePoints
+    target: SurfacePoints
 
     @classmethod
     def of_vertices(cls, pairs: npt.NDArray[np.integer], names: Sequence[str] = ()) -> Landmarks:
         """Pairs (L, 2) of a source and a target vertex."""
-        both = np.asarray(pairs, np.int64).reshape(-1, 2)
-        return cls(tuple(names) or ("",) * len(both), Places.of_vertices(both[:, 0]), Places.of_vertices(both[:, 1]))
+        vertices = np.asarray(pairs, np.int64).reshape(-1, 2)
+        return cls(
+            tuple(names) or ("",) * len(vertices),
+            SurfacePoints.of_vertices(vertices[:, 0]),
+            SurfacePoints.of_vertices(vertices[:, 1]),
+        )
 
     def __len__(self) -> int:
         """How many there are."""
@@ -277,35 +281,35 @@ class Landmarks:
     @property
     def nearest_vertices(self) -> Indices:
         """(L, 2) the vertices of both meshes that weigh most in each place."""
-        both = [places.corners[np.arange(len(self)), places.weights.argmax(axis=1)] for places in self._sides]
-        return np.stack(both, axis=1)
+        columns = [side.corners[np.arange(len(self)), side.weights.argmax(axis=1)] for side in self._sides]
+        return np.stack(columns, axis=1)
 
     @property
-    def _sides(self) -> tuple[Places, Places]:
+    def _sides(self) -> tuple[SurfacePoints, SurfacePoints]:
         return self.source, self.target
 
-    def check(self, source_vertices: int, target_vertices: int) -> None:
+    def check(self, source_vertices: int, target_vertices: int, where: object = "landmarks") -> None:
         """Refuse vertices that do not exist."""
-        for name, places, count in zip(
+        for name, points, count in zip(
             ("source", "target"), self._sides, (source_vertices, target_vertices), strict=True
         ):
-            if len(self) and not 0 <= places.corners.min() <= places.corners.max() < count:
+            if len(self) and not 0 <= points.corners.min() <= points.corners.max() < count:
                 raise FaceDiffError(
-                    f"landmarks: name {name} vertex {int(places.corners.max())} of {count}; count vertices from 0"
+                    f"{where}: name {name} vertex {int(points.corners.max())} of {count}; count vertices from 0"
                 )
 
     def refuse_contradictions(self, where: object) -> None:
         """Refuse pairs of one place with several places of the other mesh; the same pair may be repeated.
 
         Args:
-            where: what messages call the pairs.
+            where: the pairs' name in messages.
         """
-        places = [list(map(str, np.hstack([side.corners, side.weights]).tolist())) for side in self._sides]
-        for name, one, other in (("source", *places), ("target", *reversed(places))):
+        points = [list(map(str, np.hstack([side.corners, side.weights]).tolist())) for side in self._sides]
+        for name, one, opposite in (("source", *points), ("target", *reversed(points))):
             partners: dict[str, int] = {}
-            for number, (place, partner) in enumerate(zip(one, other, strict=True)):
-                first = partners.setdefault(place, number)
-                if other[first] != partner:
+            for number, (point, partner) in enumerate(zip(one, opposite, strict=True)):
+                first = partners.setdefault(point, number)
+                if opposite[first] != partner:
                     raise FaceDiffError(
                         f"{where}: pairs {first + 1} and {number + 1} give one place of the {name} mesh two places of "
                         f"the other mesh; keep one of them"
@@ -314,13 +318,11 @@ class Landmarks:
 
 def common_landmarks(source: npt.NDArray[np.floating], target: npt.NDArray[np.floating]) -> Landmarks | None:
     """The named pairs of two meshes (V, 3) of known topologies; None if one of them is another one."""
-    both = [known_topology(points) for points in (source, target)]
-    if both[0] is None or both[1] is None:
+    templates = [known_topology(points) for points in (source, target)]
+    if templates[0] is None or templates[1] is None:
         return None
-    names = [name for name in both[0].vertices if name in both[1].vertices]
-    pairs = np.array(
-        [[named_places.vertices[name] for named_places in both if named_places is not None] for name in names]
-    )
+    names = [name for name in templates[0].vertices if name in templates[1].vertices]
+    pairs = np.array([[template.vertices[name] for template in templates if template is not None] for name in names])
     return Landmarks.of_vertices(pairs, names)
 
 
@@ -331,7 +333,10 @@ EXAMPLE = "`source vertex,target vertex`, counted from 0, or a name of both such
 
 
 def read_landmarks(
-    path: Path, source: Known | None = None, target: Known | None = None, counts: tuple[int, int] | None = None
+    path: Path,
+    source: LandmarkTemplate | None = None,
+    target: LandmarkTemplate | None = None,
+    counts: tuple[int, int] | None = None,
 ) -> Landmarks:
     """Pairs of places from a file: a CSV of two columns, or JSON as :func:`write_landmarks` writes it.
 
@@ -350,18 +355,18 @@ def read_landmarks(
     names, pairs = [], []
     for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
         cells = [cell.strip() for cell in line if cell.strip()]
-        named = any(cell in NAMES for cell in cells)
-        if not cells or (number == 1 and not named and not any(map(is_number, cells))):
+        has_name = any(cell in NAMES for cell in cells)
+        if not cells or (number == 1 and not has_name and not any(map(is_number, cells))):
             continue
-        if len(cells) == 1 and named:
+        if len(cells) == 1 and has_name:
             cells = cells * 2
         if len(cells) != 2 or not all(cell in NAMES or _whole(cell) for cell in cells):
             wrong = next((cell for cell in cells if cell.isidentifier() and cell not in NAMES), None)
             remedy = f'there is no name "{wrong}": {choices(wrong, NAMES)}' if wrong else f"expected {EXAMPLE}"
             raise FaceDiffError(f"{path}: line {number} is {','.join(line)}; {remedy}")
         row = [
-            int(cell) if _whole(cell) else _vertex_of(cell, named_places, side, path)
-            for cell, named_places, side in zip(cells, (source, target), ("source", "target"), strict=True)
+            int(cell) if _whole(cell) else _vertex_of(cell, template, side, path)
+            for cell, template, side in zip(cells, (source, target), ("source", "target"), strict=True)
         ]
         pairs.append(row)
         names.append(next((cell for cell in cells if cell in NAMES), ""))
@@ -385,71 +390,79 @@ def _whole(word: str) -> bool:
     return word.isascii() and word.isdecimal() and len(word) <= DIGITS
 
 
-def _vertex_of(name: str, named_places: Known | None, side: str, where: object) -> int:
-    if named_places is None or name not in named_places.vertices:
-        have = list(named_places.vertices) if named_places is not None else []
+def _vertex_of(name: str, template: LandmarkTemplate | None, side: str, where: object) -> int:
+    if template is None or name not in template.vertices:
+        have = list(template.vertices) if template is not None else []
         remedy = f"{choices(name, have)}, or a vertex" if have else "give its vertex"
         raise FaceDiffError(f"{where}: {name} is not known on the {side} mesh; {remedy}")
-    return named_places.vertices[name]
+    return template.vertices[name]
 
 
 def parse_landmarks(
-    content: Any,  # noqa: ANN401 - of a JSON file
+    content: object,
     where: object,
-    source: Known | None = None,
-    target: Known | None = None,
+    source: LandmarkTemplate | None = None,
+    target: LandmarkTemplate | None = None,
     counts: tuple[int, int] | None = None,
 ) -> Landmarks:
-    """Pairs of places from what a JSON file or a page holds.
+    """Pairs of points from the content of a JSON file or a page.
 
     Args:
         content: plain data.
-        where: what messages call it.
-        source: named places of the source; None for none.
+        where: its name in messages.
+        source: named landmarks of the source; None for none.
         target: of the target.
-        counts: vertices of both meshes, where the places are checked against them.
+        counts: vertices of both meshes, to check the points against.
     """
-    content = content if isinstance(content, dict) else {}
-    check_format(where, str(content.get("format")), FORMAT)
-    rows = content.get("landmarks")
-    if not isinstance(rows, list) or not 0 < len(rows) <= MOST:
-        raise FaceDiffError(f"{where}: its landmarks are no list of 1 to {MOST} places; pick them again")
-    names, sides = [], ([], [])  # type: tuple[list[str], tuple[list[Any], list[Any]]]
-    for number, row in enumerate(rows, 1):
-        name = row.get("name") if isinstance(row, dict) else None
-        if not isinstance(row, dict) or not isinstance(name, str) or len(name) > LONGEST_NAME:
+    record = read_record(_File, content, where, strict=False)
+    check_format(where, record.format, FORMAT)
+    for key, stated, count in zip(
+        ("source", "target"), (record.source_vertices, record.target_vertices), counts or (None, None), strict=True
+    ):
+        # Vertex numbers of another mesh would be valid and wrong.
+        if not 0 < len(record.landmarks) <= MOST or (stated and count and stated != count):
             raise FaceDiffError(
-                f"{where}: landmark {number} has no name; expected a text of up to {LONGEST_NAME} letters"
+                f"{where}: holds {len(record.landmarks)} pairs, picked on a {key} mesh of {stated} vertices; expected "
+                f"1 to {MOST} pairs on a mesh of {count}"
             )
-        names.append(name)
-        for key, named_places, side in zip(("source", "target"), (source, target), sides, strict=True):
-            side.append(_place(row.get(key), f"{where}: landmark {number}, {key}", name, named_places, key))
-    places = [
-        Places(
-            np.array([corners for corners, _ in places_of_side], np.int64),
-            np.array([weights for _, weights in places_of_side]),
-        )
-        for places_of_side in sides
-    ]
-    landmarks = Landmarks(tuple(names), places[0], places[1])
-    for key, places_of, position in (("source", places[0], 0), ("target", places[1], 1)):
-        # The file says what it was picked on: vertex numbers of another mesh would be valid and wrong.
-        count = content.get(f"{key}_vertices")
-        expected = None if counts is None else counts[position]
-        if expected is not None and (count not in (None, expected) or places_of.corners.max() >= expected):
-            raise FaceDiffError(
-                f"{where}: was picked on a {key} mesh of {count} vertices, not {expected}; give that mesh"
-            )
+    sides = []
+    for key, template in (("source", source), ("target", target)):
+        points = [
+            _point(getattr(row, key), f"{where}: landmark {number}, {key}", row.name, template, key)
+            for number, row in enumerate(record.landmarks, 1)
+        ]
+        corners, weights = zip(*points, strict=True)
+        sides.append(SurfacePoints(np.array(corners, np.int64), np.array(weights)))
+    landmarks = Landmarks(tuple(row.name for row in record.landmarks), *sides)
+    if counts is not None:
+        landmarks.check(*counts, where)
     landmarks.refuse_contradictions(where)
     return landmarks
 
 
-def _place(
-    value: object, where: str, name: str, named_places: Known | None, side: str
+@dataclass(frozen=True)
+class _Row:
+    name: Annotated[str, Text(longest=LONGEST_NAME)]
+    source: Any = None
+    target: Any = None
+
+
+@dataclass(frozen=True)
+class _File:
+    """The content of a .json file of landmarks."""
+
+    format: str
+    landmarks: tuple[_Row, ...]
+    source_vertices: int | None = None
+    target_vertices: int | None = None
+
+
+def _point(
+    value: object, where: str, name: str, template: LandmarkTemplate | None, side: str
 ) -> tuple[list[int], list[float]]:
-    """Corners and weights of one place."""
+    """Corners and weights of one point of a surface."""
     if value is None and name in NAMES:
-        value = _vertex_of(name, named_places, side, where)
+        value = _vertex_of(name, template, side, where)
     if _is_index(value):
         return [int(value)] * 3, [1.0, 0.0, 0.0]  # type: ignore[call-overload]
     if isinstance(value, dict):
@@ -464,7 +477,7 @@ def _place(
         ):
             total = sum(max(weight, 0.0) for weight in weights)
             return [int(corner) for corner in corners], [max(weight, 0.0) / total for weight in weights]
-    raise FaceDiffError(f"{where}: is no place; expected a vertex, or three corners with weights whose sum is 1")
+    raise FaceDiffError(f"{where}: is {quoted(value)}; expected a vertex, or three corners with weights of sum 1")
 
 
 def _is_index(value: object) -> bool:
@@ -476,8 +489,8 @@ def as_rows(landmarks: Landmarks) -> list[dict[str, Any]]:
     rows = []
     for number, name in enumerate(landmarks.names):
         row: dict[str, Any] = {"name": name}
-        for key, places in (("source", landmarks.source), ("target", landmarks.target)):
-            corners, weights = places.corners[number].tolist(), places.weights[number].tolist()
+        for key, points in (("source", landmarks.source), ("target", landmarks.target)):
+            corners, weights = points.corners[number].tolist(), points.weights[number].tolist()
             row[key] = corners[0] if weights[0] == 1.0 else {"corners": corners, "weights": weights}
         rows.append(row)
     return rows

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.editing.eyes import MEET
-from facediff.editing.face_features import LIDS, SAMPLES, Features, Opening, Seen
+from facediff.editing.face_features import LIDS, SAMPLES, Features, FrontView, Opening
 from facediff.editing.surface import Surface
 from facediff.utils.numerics import smooth_step
 
@@ -67,7 +67,7 @@ class LidEdges:
 
     opening: Opening
     rims: tuple[Indices, Indices]  # vertices along the upper and the lower edge
-    places: tuple[Array, Array]  # of these along the edges, increasing, from 0 to SAMPLES - 1
+    positions: tuple[Array, Array]  # of these along the edges, increasing, from 0 to SAMPLES - 1
     axes: Array  # (3, 3) rows: from the smaller to the larger x, from the lower to the upper edge, forwards
     gaps: Array  # (SAMPLES, 3) from the lower to the upper edge, along the axes
     step: float  # median length of the triangles' edges along the lids
@@ -75,10 +75,12 @@ class LidEdges:
     def displacements(self, vertices: npt.NDArray[np.floating], rest: npt.NDArray[np.floating] | float = 0.0) -> Array:
         """Displacements (T, 2, SAMPLES, 3) of the edges, along the axes, from vertices (T, V, 3) and those at rest."""
         sides = []
-        for rim, places in zip(self.rims, self.places, strict=True):
-            low = np.clip(np.searchsorted(places, np.arange(SAMPLES), "right") - 1, 0, max(len(rim) - 2, 0))
+        for rim, positions in zip(self.rims, self.positions, strict=True):
+            low = np.clip(np.searchsorted(positions, np.arange(SAMPLES), "right") - 1, 0, max(len(rim) - 2, 0))
             high = np.minimum(low + 1, len(rim) - 1)
-            part = np.clip((np.arange(SAMPLES) - places[low]) / np.maximum(places[high] - places[low], 1e-12), 0, 1)
+            part = np.clip(
+                (np.arange(SAMPLES) - positions[low]) / np.maximum(positions[high] - positions[low], 1e-12), 0, 1
+            )
             at = np.asarray(vertices[:, rim], np.float64) - (rest if isinstance(rest, float) else rest[rim])
             sides.append(at[:, low] + part[:, None] * (at[:, high] - at[:, low]))
         return evened(np.stack(sides, axis=1) @ self.axes.T, 1.5, axis=2)
@@ -99,11 +101,11 @@ class EyeballDepth:
 
     def at(self, points: Array) -> Array:
         """Depth (…,) of the eyeball behind or in front of points (…, 3)."""
-        place = (points[..., :2] - self.low) / self.step - 0.5
-        whole = np.clip(np.floor(place).astype(int), 0, GRID - 2)
-        part = np.clip(place - whole, 0.0, 1.0)
-        inside = ((place >= 0) & (place <= GRID - 1)).all(axis=-1)
-        column, row = whole[..., 0], whole[..., 1]
+        pixel = (points[..., :2] - self.low) / self.step - 0.5
+        corner = np.clip(np.floor(pixel).astype(int), 0, GRID - 2)
+        part = np.clip(pixel - corner, 0.0, 1.0)
+        inside = ((pixel >= 0) & (pixel <= GRID - 1)).all(axis=-1)
+        column, row = corner[..., 0], corner[..., 1]
         corners = [self.depth[row + i, column + j] for i in (0, 1) for j in (0, 1)]
         x, y = part[..., 0], part[..., 1]
         with np.errstate(invalid="ignore"):
@@ -125,29 +127,29 @@ class EyeLids:
     def target_edges(self, moves: Array) -> Array:
         """Displacements (T, 2, SAMPLES, 3) of the target's edges, for those of the source's along its axes."""
         assert self.target is not None  # noqa: S101 - for type checkers
-        own, new = self.source.gaps, self.target.gaps
+        source_gaps, target_gaps = self.source.gaps, self.target.gaps
         least = EVENED * np.array([self.source.height, self.target.height])
-        tall = (new[:, 1] + least[1]) / (own[:, 1] + least[0])
+        tall = (target_gaps[:, 1] + least[1]) / (source_gaps[:, 1] + least[0])
         wide = self.target.opening.width / self.source.opening.width
         edges = wide * moves
         # Towards the other lid: the share of the opening that the source's lid goes.
         edges[..., 1] = tall * moves[..., 1]
         # Closing lids meet in depth as well; how far they bulge in front of the straight way is the source's.
-        travel = moves[..., 1] / (own[:, 1] + least[0])
-        edges[..., 2] = wide * (moves[..., 2] - travel * own[:, 2]) + travel * new[:, 2]
+        travel = moves[..., 1] / (source_gaps[:, 1] + least[0])
+        edges[..., 2] = wide * (moves[..., 2] - travel * source_gaps[:, 2]) + travel * target_gaps[:, 2]
         # What is left of the opening is exactly the source's share, and never less than none: lids do not pass.
-        left = own[:, 1] + moves[:, 0, :, 1] - moves[:, 1, :, 1]
-        left = (left + EVENED * left.mean(axis=1, keepdims=True)) / (own[:, 1] + least[0])
+        left = source_gaps[:, 1] + moves[:, 0, :, 1] - moves[:, 1, :, 1]
+        left = (left + EVENED * left.mean(axis=1, keepdims=True)) / (source_gaps[:, 1] + least[0])
         # In the corners, where there is hardly an opening, the share of the whole eye says more than their own, and
         # nowhere is much more left than there: a rim that is read a little wrong would leave a hole.
-        whole = np.maximum(left @ own[:, 1] / own[:, 1].sum(), 0.0)[:, None]
-        open_here = np.clip(own[:, 1] / (CORNER * own[:, 1].max()), 0.0, 1.0)
-        left = np.minimum(open_here * left + (1.0 - open_here) * whole, MORE * whole)
+        mean_left = np.maximum(left @ source_gaps[:, 1] / source_gaps[:, 1].sum(), 0.0)[:, None]
+        open_here = np.clip(source_gaps[:, 1] / (CORNER * source_gaps[:, 1].max()), 0.0, 1.0)
+        left = np.minimum(open_here * left + (1.0 - open_here) * mean_left, MORE * mean_left)
         # Edges are read to a few hundredths of the opening: what is nearly shut is shut.
         left = np.maximum(left - SHUTS, 0.0) / (1.0 - SHUTS)
         # Shut, the upper edge lies a little over the lower one, so that no gap shows between coarse edges.
-        lap = (LAP + ROUGH * self.target.step / self.target.height) * new[:, 1] * np.maximum(1.0 - left, 0.0)
-        over = left * new[:, 1] - lap - (new[:, 1] + edges[:, 0, :, 1] - edges[:, 1, :, 1])
+        lap = (LAP + ROUGH * self.target.step / self.target.height) * target_gaps[:, 1] * np.maximum(1.0 - left, 0.0)
+        over = left * target_gaps[:, 1] - lap - (target_gaps[:, 1] + edges[:, 0, :, 1] - edges[:, 1, :, 1])
         edges[:, 0, :, 1] += (1.0 - MEET) * over
         edges[:, 1, :, 1] -= MEET * over
         return edges
@@ -164,14 +166,14 @@ def eye_lids(
         features: openings of both.
         at_rest: whether the target's lids stay at rest; so they do where one of its eyes has no opening.
     """
-    own = [lid_edges(source.vertices, features[0], eye) for eye in (0, 1)]
-    if own[0] is None or own[1] is None:
+    source_edges = [lid_edges(source.vertices, features[0], eye) for eye in (0, 1)]
+    if source_edges[0] is None or source_edges[1] is None:
         return None
-    new = [lid_edges(laid.vertices, features[1], eye) for eye in (0, 1)]
-    rest = at_rest or new[0] is None or new[1] is None
+    target_edges = [lid_edges(laid.vertices, features[1], eye) for eye in (0, 1)]
+    rest = at_rest or target_edges[0] is None or target_edges[1] is None
     balls = [None, None] if rest else [eyeball_depth(laid, features[1], eye) for eye in (0, 1)]
     lids = []
-    for eye, (one, two, ball) in enumerate(zip(own, new, balls, strict=True)):
+    for eye, (one, two, ball) in enumerate(zip(source_edges, target_edges, balls, strict=True)):
         assert one is not None  # noqa: S101 - for type checkers
         nothing = LidField(
             np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 2)), np.eye(3)
@@ -200,32 +202,34 @@ def lid_edges(vertices: Array, features: Features, eye: int) -> LidEdges | None:
         return None
     up /= np.linalg.norm(up)
     axes = np.stack([across, up, np.cross(across, up)])
-    rims, places = [], []
+    rims, positions = [], []
     for curve, seeds, code in (
         (opening.upper, opening.upper_seeds, LIDS[eye][0]),
         (opening.lower, opening.lower_seeds, LIDS[eye][1]),
     ):
-        own = seeds[features.codes[seeds] == code]
-        own = own if len(own) >= 2 else seeds
+        lid = seeds[features.codes[seeds] == code]
+        lid = lid if len(lid) >= 2 else seeds
         # Seeds are the corners of the triangles along the edge: those that are nearest to it somewhere are the rim.
-        away = np.linalg.norm(vertices[own][None] - curve[:, None], axis=2)
-        rim = own[np.unique(away.argmin(axis=1))]
-        place = along(vertices[rim], curve)[0]
-        inner = (place > 1.0) & (place < SAMPLES - 2.0)
+        away = np.linalg.norm(vertices[lid][None] - curve[:, None], axis=2)
+        rim = lid[np.unique(away.argmin(axis=1))]
+        position = along(vertices[rim], curve)[0]
+        inner = (position > 1.0) & (position < SAMPLES - 2.0)
         # Both lids end in the corners, which belong to neither.
         ends = [np.flatnonzero(features.skin)[_nearest(vertices[features.skin], curve[end])] for end in (0, -1)]
         rim = np.concatenate([[ends[0]], rim[inner], [ends[1]]])
-        place = np.concatenate([[0.0], place[inner], [SAMPLES - 1.0]])
-        order = np.unique(np.round(place, 3), return_index=True)[1]
+        position = np.concatenate([[0.0], position[inner], [SAMPLES - 1.0]])
+        order = np.unique(np.round(position, 3), return_index=True)[1]
         rims.append(rim[order])
-        places.append(place[order])
+        positions.append(position[order])
     if min(len(rim) for rim in rims) < 3:
         return None
     # Edges are seen to a pixel or two, in depth on the front or the back of a lid: both would ripple the skin.
     heights = evened(gaps @ axes.T, 1.0)
     heights[:, [0, 2]] = evened(heights[:, [0, 2]], 4.0)
     step = float(np.median(np.concatenate([np.linalg.norm(np.diff(vertices[rim], axis=0), axis=1) for rim in rims])))
-    return LidEdges(opening, (rims[0], rims[1]), (places[0], places[1]), axes, heights, min(step, opening.width / 4))
+    return LidEdges(
+        opening, (rims[0], rims[1]), (positions[0], positions[1]), axes, heights, min(step, opening.width / 4)
+    )
 
 
 def evened(values: Array, samples: float, axis: int = 0) -> Array:
@@ -236,7 +240,7 @@ def evened(values: Array, samples: float, axis: int = 0) -> Array:
 
 
 def along(points: Array, curve: Array) -> tuple[Array, Array]:
-    """Places (N,) of points along a curve (K, 3), from 0 to K - 1, and their distances (N,) from it."""
+    """SurfacePoints (N,) of points along a curve (K, 3), from 0 to K - 1, and their distances (N,) from it."""
     first, way = curve[:-1], np.diff(curve, axis=0)
     square = np.maximum(np.square(way).sum(axis=1), 1e-24)
     part = np.clip(((points[:, None] - first) * way).sum(axis=2) / square, 0.0, 1.0)
@@ -250,13 +254,13 @@ def _nearest(points: Array, to: Array) -> int:
     return int(np.square(points - to).sum(axis=1).argmin())
 
 
-def _field(vertices: Array, features: Features, eye: int, edges: LidEdges, most: float = REACH) -> LidField:
+def _field(vertices: Array, features: Features, eye: int, edges: LidEdges, share_of_width: float = REACH) -> LidField:
     opening = features.eyes[eye]
     assert opening is not None  # noqa: S101 - for type checkers
-    reach = most * opening.width
-    both = np.concatenate([opening.upper, opening.lower])
-    near = features.skin & (vertices >= both.min(axis=0) - reach).all(axis=1)
-    near &= (vertices <= both.max(axis=0) + reach).all(axis=1)
+    reach = share_of_width * opening.width
+    edge_points = np.concatenate([opening.upper, opening.lower])
+    near = features.skin & (vertices >= edge_points.min(axis=0) - reach).all(axis=1)
+    near &= (vertices <= edge_points.max(axis=0) + reach).all(axis=1)
     some = np.flatnonzero(near)
     (above, up), (below, down) = (along(vertices[some], curve) for curve in (opening.upper, opening.lower))
     codes = features.codes[some]
@@ -285,8 +289,15 @@ def _field(vertices: Array, features: Features, eye: int, edges: LidEdges, most:
         ],
         axis=1,
     )
-    kept = share > 0
-    return LidField(some[kept], np.stack([above, below], 1)[kept], upper[kept], share[kept], way[kept], edges.axes)
+    followers = share > 0
+    return LidField(
+        some[followers],
+        np.stack([above, below], 1)[followers],
+        upper[followers],
+        share[followers],
+        way[followers],
+        edges.axes,
+    )
 
 
 def eyeball_triangles(laid: Surface, features: Features, eye: int) -> Indices:
@@ -295,11 +306,11 @@ def eyeball_triangles(laid: Surface, features: Features, eye: int) -> Indices:
     if opening is None:
         return np.zeros(0, np.int64)
     width, middle = opening.width, opening.centre
-    pieces = Seen(laid.vertices, laid.faces).pieces
-    seen = Seen(laid.vertices, laid.faces).within(middle[:2] - 0.5 * width, middle[:2] + 0.5 * width)
-    names = np.unique(pieces[laid.faces[seen, 0]])
+    pieces = FrontView(laid.vertices, laid.faces).pieces
+    triangles = FrontView(laid.vertices, laid.faces).within(middle[:2] - 0.5 * width, middle[:2] + 0.5 * width)
+    names = np.unique(pieces[laid.faces[triangles, 0]])
     label = pieces[laid.faces[:, 0]]
-    chosen = []
+    ball_triangles = []
     for name in names:
         some = np.flatnonzero(label == name)
         points = laid.vertices[np.unique(laid.faces[some])]
@@ -313,8 +324,8 @@ def eyeball_triangles(laid: Surface, features: Features, eye: int) -> Indices:
             and (np.abs(centre - middle)[:2] < 0.5 * width).all()
             and np.median(points[:, 2]) < middle[2] + 0.2 * width
         ):
-            chosen.append(some)
-    return np.concatenate([np.zeros(0, np.int64), *chosen])
+            ball_triangles.append(some)
+    return np.concatenate([np.zeros(0, np.int64), *ball_triangles])
 
 
 def eyeball_depth(laid: Surface, features: Features, eye: int) -> EyeballDepth | None:
@@ -324,7 +335,7 @@ def eyeball_depth(laid: Surface, features: Features, eye: int) -> EyeballDepth |
         return None
     half = WINDOW * opening.width
     low, step = opening.centre[:2] - half, 2.0 * half / GRID
-    return EyeballDepth(low, step, Seen(laid.vertices, laid.faces).raster(triangles, low, step, GRID, GRID)[1])
+    return EyeballDepth(low, step, FrontView(laid.vertices, laid.faces).raster(triangles, low, step, GRID, GRID)[1])
 
 
 def _clearance(laid: Surface, field: LidField, ball: EyeballDepth, width: float) -> Array:
@@ -332,9 +343,9 @@ def _clearance(laid: Surface, field: LidField, ball: EyeballDepth, width: float)
     rest = points[:, 2] - ball.at(points)
     # A flat triangle cuts into a round ball by its edge's square over eight radii.
     edge = np.concatenate([laid.faces[:, [0, 1]], laid.faces[:, [1, 2]], laid.faces[:, [2, 0]]])
-    long = np.linalg.norm(laid.vertices[edge[:, 0]] - laid.vertices[edge[:, 1]], axis=1)
+    lengths = np.linalg.norm(laid.vertices[edge[:, 0]] - laid.vertices[edge[:, 1]], axis=1)
     count = len(laid.vertices)
-    mean = np.bincount(edge[:, 0], long, count) / np.maximum(np.bincount(edge[:, 0], None, count), 1)
+    mean = np.bincount(edge[:, 0], lengths, count) / np.maximum(np.bincount(edge[:, 0], None, count), 1)
     sag = np.minimum(np.square(mean[field.vertices]) / (8 * RADIUS * width), 0.1 * width)
     return np.where(np.isfinite(rest), np.minimum(rest, OVER * width + sag), OVER * width + sag)
 

@@ -23,17 +23,17 @@ class FrameSolver:
     The objective, the bounds and the options are those of :func:`~facediff.editing.blendshapes.solve`. That knows the
     whole motion; here, the future is not known yet:
 
-    - A frame is held near the last one only, whose weights are final; the face at rest goes before the first one.
+    - A frame is held near the last one only, which has final weights; the face at rest goes before the first one.
     - A shape that gains less than it costs is at 0 until the frame in which it begins to work. It fades for as long as
       there; it does not begin before.
 
-    What is constant is computed once: the matrix of the shapes, the projection of vertices on them (a frame's only
-    product over vertices), and the inverses of its parts, see :class:`~facediff.editing.bounded.Pivoting`.
+    Constants are computed once: the matrix of the shapes, the projection of vertices on them (a frame's only product
+    over vertices), and the inverses of its parts, see :class:`~facediff.editing.bounded.Pivoting`.
 
     Args:
         shapes: K shapes of the face's topology.
         frame_rate: frames a second.
-        faces: triangles (F, 3) by whose areas vertices count; None to count all alike.
+        faces: triangles (F, 3) for weights by area; None to count all vertices alike.
         regions: vertices by name, for ``options.region``.
         unit: of length, for :meth:`residual_mm`.
         options: the usual ones if None; `residual_limit` has no meaning here.
@@ -89,8 +89,8 @@ class FrameSolver:
         Args:
             offsets: (V, 3) of the vertices from the neutral face.
         """
-        used = offsets if self._all else offsets[self._used]
-        right = self._projection @ used.reshape(-1).astype(np.float64)
+        moving = offsets if self._all else offsets[self._used]
+        right = self._projection @ moving.reshape(-1).astype(np.float64)
         if not np.isfinite(right).all():
             raise FaceDiffError("frame: holds NaN or infinity; generate the motion again")
         right += self._coupling * self._last
@@ -103,11 +103,11 @@ class FrameSolver:
         self._last = self._final.solve(right, lower, upper)
         weights = np.full(len(self.shapes.names), np.clip(0.0, self.options.lower, self.options.upper))
         # Division may lead past a bound by a rounding error.
-        weights[self._moving.places] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
+        weights[self._moving.indices] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
         return weights
 
     def _least_sum(self, right: Array) -> Array:
-        """The solution with what the use of shapes costs added to the objective."""
+        """The solution with the cost of shapes added to the objective."""
         if (self._lower >= 0).all():
             return self._sum.solve(right - self._cost, self._lower, self._upper)
         problem = Problem(self._sum.matrix, right[None], 0.0, self._lower, self._upper)
@@ -116,5 +116,5 @@ class FrameSolver:
     def residual_mm(self, offsets: npt.NDArray[np.floating], weights: Array) -> float:
         """Root-mean-square distance over the vertices that count that weights (K,) leave of offsets (V, 3), in mm."""
         moving = self._moving
-        left = np.asarray(offsets, np.float64)[moving.vertices].reshape(-1) - weights[moving.places] @ moving.deltas
+        left = np.asarray(offsets, np.float64)[moving.vertices].reshape(-1) - weights[moving.indices] @ moving.deltas
         return self._millimetres * float(np.sqrt(np.square(left).sum() / len(moving.vertices)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from facediff.editing.face_features import Features, Seen, find_features
+from facediff.editing.face_features import Features, FrontView, find_features
 from facediff.editing.surface import Surface, nearest
 from facediff.mesh import Similarity, align, face_size
 from facediff.mesh.alignment import TUKEY
@@ -44,25 +44,25 @@ def place(
     multiple range images", IVC 1992 (distances to planes).
     """
     random = np.random.default_rng(0)
-    used = np.unique(moved.faces)
-    used = used if len(used) <= samples else np.sort(random.choice(used, samples, replace=False))
+    vertices = np.unique(moved.faces)
+    vertices = vertices if len(vertices) <= samples else np.sort(random.choice(vertices, samples, replace=False))
     # Seeded above: the same two meshes give the same similarity every time.
-    points, normals, similarity = moved.vertices[used], moved.normals[used], start or _start(moved, goal)
+    points, normals, similarity = moved.vertices[vertices], moved.normals[vertices], start or _start(moved, goal)
     for _ in range(rounds):  # Gauss-Newton on the distances to the planes, with Tukey's biweight
         laid = similarity.apply(points)
-        there = nearest(goal, laid, normals @ similarity.rotation.T, size=0.0)
+        matches = nearest(goal, laid, normals @ similarity.rotation.T, size=0.0)
         # The weights follow the spread of the distances, so that parts that one mesh lacks lose their influence as the
         # rest comes closer.
         # 1.4826 turns the median of distances into a standard deviation, as for normally distributed errors. The
         # floor keeps the weights defined for meshes that lie on one another exactly.
-        spread = max(1.4826 * float(np.median(there.distances)), 1e-9 * goal.size)
-        weights = np.square(np.clip(1.0 - np.square(there.distances / (TUKEY * spread)), 0.0, None))
+        spread = max(1.4826 * float(np.median(matches.distances)), 1e-9 * goal.size)
+        weights = np.square(np.clip(1.0 - np.square(matches.distances / (TUKEY * spread)), 0.0, None))
         # Sheets that face another way, such as the inside of a lip or the back of the head, attract nothing.
-        weights *= there.cosines > 0.5
+        weights *= matches.cosines > 0.5
         # Seven unknowns want a few times as many places; with fewer, the similarity of the last round stands.
         if np.count_nonzero(weights) < 20:
             break
-        step = _towards_planes(laid, there.points, there.normals, weights, goal.size)
+        step = _towards_planes(laid, matches.points, matches.normals, weights, goal.size)
         similarity = similarity.then(step)
         if np.abs(step.apply(laid) - laid).max() < SETTLED * goal.size:
             break
@@ -73,8 +73,8 @@ def _start(moved: Surface, goal: Surface) -> Similarity:
     from scipy.spatial.transform import Rotation
 
     random = np.random.default_rng(0)
-    used = [(surface.vertices, np.unique(surface.faces)) for surface in (moved, goal)]
-    source, target = (points[random.choice(some, min(SAMPLES, len(some)), replace=False)] for points, some in used)
+    meshes = [(surface.vertices, np.unique(surface.faces)) for surface in (moved, goal)]
+    source, target = (points[random.choice(some, min(SAMPLES, len(some)), replace=False)] for points, some in meshes)
     axes = [np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2] for points in (source, target)]
     principal = [axes[1].T @ np.diag(signs) @ axes[0] for signs in itertools.product((1.0, -1.0), repeat=3)]
     proper = [turn for turn in principal if np.linalg.det(turn) > 0]
@@ -87,10 +87,10 @@ def _start(moved: Surface, goal: Surface) -> Similarity:
             trial, apart = _by_vertices(source, target, trial)
         trials.append((apart, trial))
     # Five rounds are enough to tell good starts from bad ones; only the best one is continued.
-    own, (least, best) = trials[0], min(trials, key=lambda pair: pair[0])
+    unrotated, (least, best) = trials[0], min(trials, key=lambda pair: pair[0])
     # Faces are nearly symmetric, so that a mirrored start fits almost as well: the meshes' own axes win unless another
     # start is clearly better.
-    best_start = best if least < CLEARLY * own[0] else own[1]
+    best_start = best if least < CLEARLY * unrotated[0] else unrotated[1]
     for _ in range(COARSE_ROUNDS):
         best_start, _ = _by_vertices(source, target, best_start)
     return best_start
@@ -107,9 +107,9 @@ def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Sim
     apart = away[pairs[0], pairs[1]]
     # Trimmed: the furthest pairs are of parts that one mesh lacks (Chetverikov et al., "The trimmed iterative closest
     # point algorithm", ICPR 2002).
-    counted = apart <= np.quantile(apart, TRIMMED)
-    similarity = align(source[pairs[0]], target[pairs[1]], weights=counted.astype(np.float64), scale=True)
-    return similarity, float(apart[counted].mean() / face_size(target))
+    inliers = apart <= np.quantile(apart, TRIMMED)
+    similarity = align(source[pairs[0]], target[pairs[1]], weights=inliers.astype(np.float64), scale=True)
+    return similarity, float(apart[inliers].mean() / face_size(target))
 
 
 def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array, size: float) -> Similarity:
@@ -156,32 +156,34 @@ def place_face(
 
     points, normals = _face_of(goal, features)
     if start is not None:
-        fine = place(_near(moved, start, points, features), goal, start, samples=700, rounds=30)
-        return fine, find_features(fine.apply(moved.vertices), moved.faces, features)
+        refined = place(_near(moved, start, points, features), goal, start, samples=700, rounds=30)
+        return refined, find_features(refined.apply(moved.vertices), moved.faces, features)
     tried: list[tuple[float, Similarity, Features | None]] = []
-    own = np.eye(3)[None]
+    identity = np.eye(3)[None]
     for turns in (Rotation.create_group("O").as_matrix(), Rotation.create_group("I").as_matrix()):
-        candidates = _candidates_for(moved, goal, points, normals, np.concatenate([own, turns]), features.mouth.width)
+        candidates = _candidates_for(
+            moved, goal, points, normals, np.concatenate([identity, turns]), features.mouth.width
+        )
         least = candidates[0][0]
         for apart, start in candidates[:LOOKED_AT]:
             if apart > 2.0 * least:
                 break
             back = start.inverse()
-            seen = find_features(back.apply(moved.vertices), moved.faces, features)
+            target_features = find_features(back.apply(moved.vertices), moved.faces, features)
             worth = apart
-            if seen is not None:
-                worth *= WITH_MOUTH * WITH_EYE ** sum(eye is not None for eye in seen.eyes)
-            tried.append((worth, back, seen))
+            if target_features is not None:
+                worth *= WITH_MOUTH * WITH_EYE ** sum(eye is not None for eye in target_features.eyes)
+            tried.append((worth, back, target_features))
             # A mouth and both eyes in their places settle it, and every further look costs a rendering of the mesh.
-            if seen is not None and worth < CLEARLY * WITH_MOUTH * WITH_EYE**2 * apart:
+            if target_features is not None and worth < CLEARLY * WITH_MOUTH * WITH_EYE**2 * apart:
                 break
-        if any(seen is not None for _, _, seen in tried):
+        if any(target_features is not None for _, _, target_features in tried):
             break
-    _, back, seen = min(tried, key=lambda trial: trial[0])
-    fine = place(_near(moved, back, points, features), goal, back, samples=700, rounds=30)
-    if seen is not None:
-        seen = find_features(fine.apply(moved.vertices), moved.faces, features) or seen
-    return fine, seen
+    _, back, target_features = min(tried, key=lambda trial: trial[0])
+    refined = place(_near(moved, back, points, features), goal, back, samples=700, rounds=30)
+    if target_features is not None:
+        target_features = find_features(refined.apply(moved.vertices), moved.faces, features) or target_features
+    return refined, target_features
 
 
 def _near(moved: Surface, back: Similarity, points: Array, features: Features) -> Surface:
@@ -190,13 +192,13 @@ def _near(moved: Surface, back: Similarity, points: Array, features: Features) -
     margin = 0.3 * features.mouth.width
     low, high = points.min(axis=0) - [margin, margin, 2 * margin], points.max(axis=0) + margin
     inside = ((laid >= low) & (laid <= high)).all(axis=1)
-    kept = inside[moved.faces].all(axis=1)
-    return Surface(moved.vertices, moved.faces[kept]) if np.count_nonzero(kept) >= 50 else moved
+    triangles = inside[moved.faces].all(axis=1)
+    return Surface(moved.vertices, moved.faces[triangles]) if np.count_nonzero(triangles) >= 50 else moved
 
 
 def _face_of(surface: Surface, features: Features) -> tuple[Array, Array]:
     """Points (N, 3), evenly spread in the view from the front, and normals of the skin about the mouth and the eyes."""
-    seen = Seen(surface.vertices, surface.faces)
+    view = FrontView(surface.vertices, surface.faces)
     width = features.mouth.width
     x, y, _ = features.mouth.centre
     low, high = (
@@ -205,9 +207,9 @@ def _face_of(surface: Surface, features: Features) -> tuple[Array, Array]:
     )
     step = PATCH_STEP * width
     columns, rows = np.ceil((high - low) / step).astype(int)
-    number, _, weights = seen.raster(seen.within(low, high, features.skin), low, step, int(columns), int(rows))
+    number, _, weights = view.raster(view.within(low, high, features.skin), low, step, int(columns), int(rows))
     hit = number >= 0
-    corners, shares = seen.faces[number[hit]], weights[hit]
+    corners, shares = view.faces[number[hit]], weights[hit]
     points = np.einsum("nk,nkd->nd", shares, surface.vertices[corners])
     normals = np.einsum("nk,nkd->nd", shares, surface.normals[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -223,45 +225,48 @@ def _candidates_for(
     from scipy.spatial import cKDTree
 
     random = np.random.default_rng(0)
-    used = np.unique(moved.faces)
-    used = used if len(used) <= 40_000 else np.sort(random.choice(used, 40_000, replace=False))
-    tree, facing = cKDTree(moved.vertices[used]), moved.normals[used]
+    vertices = np.unique(moved.faces)
+    vertices = vertices if len(vertices) <= 40_000 else np.sort(random.choice(vertices, 40_000, replace=False))
+    tree, facing = cKDTree(moved.vertices[vertices]), moved.normals[vertices]
     some = random.permutation(len(points))
     few, many = some[:FEW], some[:MANY]
     rotation, shift, scale = _starts(moved, goal, points, turns)
-    own = np.abs(rotation - np.eye(3)).max(axis=(1, 2)) < 1e-9
+    unrotated = np.abs(rotation - np.eye(3)).max(axis=(1, 2)) < 1e-9
     state = (rotation, shift, scale)
     # Seven rounds with few points sort the starts; only the best ones are refined, with more points and a tighter
     # cap.
     for _ in range(7):
         state, apart = _round(points[few], normals[few], tree, facing, state, 0.25 * width)
-    apart = np.where(own, CLEARLY * apart, apart)
+    apart = np.where(unrotated, CLEARLY * apart, apart)
     order = np.argsort(apart)[:CONTINUED]
-    state, own = (state[0][order], state[1][order], state[2][order]), own[order]
+    state, unrotated = (state[0][order], state[1][order], state[2][order]), unrotated[order]
     for _ in range(25):
         state, apart = _round(points[many], normals[many], tree, facing, state, 0.15 * width)
-    apart = np.where(own, CLEARLY * apart, apart)
+    apart = np.where(unrotated, CLEARLY * apart, apart)
     candidates: list[tuple[float, Similarity]] = []
     for k in np.argsort(apart):
         similar = Similarity(state[0][k], state[1][k], float(state[2][k]))
         laid = similar.apply(points[many])
         # Several starts end in one place.
-        if all(np.abs(laid - other.apply(points[many])).max() > 0.1 * width * other.scale for _, other in candidates):
+        if all(
+            np.abs(laid - candidate.apply(points[many])).max() > 0.1 * width * candidate.scale
+            for _, candidate in candidates
+        ):
             candidates.append((float(apart[k]), similar))
     return candidates
 
 
 def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple[Array, Array, Array]:
     """Rotations (B, 3, 3), translations (B, 3) and scales (B,) from the goal to the moved mesh, to begin with."""
-    whole = goal.vertices[np.unique(goal.faces)]
-    pieces = Seen(moved.vertices, moved.faces).pieces
-    used = np.unique(moved.faces)
-    names, counts = np.unique(pieces[used], return_counts=True)
+    goal_points = goal.vertices[np.unique(goal.faces)]
+    pieces = FrontView(moved.vertices, moved.faces).pieces
+    vertices = np.unique(moved.faces)
+    names, counts = np.unique(pieces[vertices], return_counts=True)
     names = names[np.argsort(-counts, kind="stable")][:MOST_GROUPS]
-    groups: list[tuple[Array, Array | None, tuple[float, ...]]] = [(moved.vertices[used], None, (0.75, 1.0, 1.33))]
-    parts = [moved.vertices[used[pieces[used] == name]] for name in names]
-    groups += [(part, None, (1.0,)) for part in parts if LEAST_GROUP <= len(part) < len(used)]
-    for part in (moved.vertices[used], *(part for part in parts if LEAST_GROUP <= len(part) < len(used))):
+    groups: list[tuple[Array, Array | None, tuple[float, ...]]] = [(moved.vertices[vertices], None, (0.75, 1.0, 1.33))]
+    parts = [moved.vertices[vertices[pieces[vertices] == name]] for name in names]
+    groups += [(part, None, (1.0,)) for part in parts if LEAST_GROUP <= len(part) < len(vertices)]
+    for part in (moved.vertices[vertices], *(part for part in parts if LEAST_GROUP <= len(part) < len(vertices))):
         extent = np.ptp(part, axis=0)
         for axis, sign in itertools.product(range(3), (1, -1)):
             # Much longer than wide: a figure or a bust, whose face is at one of its ends.
@@ -280,8 +285,8 @@ def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple
             if up is not None and (turn @ [0, 1, 0]) @ up < 0.5:
                 continue
             for factor in factors:
-                scale = factor * size / face_size(whole)
-                starts.append((turn, end.mean(axis=0) - scale * turn @ whole.mean(axis=0), scale))
+                scale = factor * size / face_size(goal_points)
+                starts.append((turn, end.mean(axis=0) - scale * turn @ goal_points.mean(axis=0), scale))
             scale = size / face_size(points)  # a mask shows no more than the face
             starts.append((turn, 0.5 * (low + high) - scale * turn @ (0.5 * (points.min(0) + points.max(0))), scale))
     return (

@@ -13,19 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.eyes import GIVE, Array, Eyes
-from facediff.errors import FaceDiffError
+from facediff.editing.eyes import Array, Eyes
 from facediff.mesh.flame import rotations
 from facediff.utils import ranges
 from facediff.utils.files import reserve_room
 from facediff.utils.numerics import smooth_step
 
-PROCEDURAL = "procedural"  # Metadata key: what was added by rules
-EDITED = "edited"  # Metadata key: how the animation's own motion was changed
+PROCEDURAL = "procedural"  # Metadata key: motion added by rules
+EDITED = "edited"  # Metadata key: changes of the animation's own motion
 SWAYS = "head sway"
 """Name of a swaying head in the metadata; such an animation moves as a whole, so that nothing can be added any more."""
 MOVED_HEAD = (SWAYS, "head keys", "head acting")
-"""Names in the metadata of whatever moves the head."""
+"""Names in the metadata of all motion of the head."""
 
 Amount = float | npt.NDArray[np.floating]
 """A number, or one for each frame (T,)."""
@@ -42,7 +41,7 @@ def random_of(layer: Layer, seed: int) -> np.random.Generator:
 # Blinks. How often people blink is from Bentivoglio et al., "Analysis of blink rate patterns in normal subjects",
 # Movement Disorders 12(6), 1997: 17 times a minute at rest, 26 in conversation, 4.5 when reading.
 
-RATE = 17.0  # Blinks a minute of somebody at rest
+RATE = 17.0  # Blinks a minute at rest
 CLOSE, SHUT, OPEN = 0.10, 0.03, 0.20
 """Seconds that the lids take to shut, stay shut, and take to open: about a third of a second, quicker down than up."""
 SPREAD = (0.85, 1.2)  # How much shorter and longer than that a blink may be
@@ -59,7 +58,7 @@ def add_blinks(animation: Animation, eyes: Eyes, *, rate: Amount = RATE, seed: i
     """
     curve = blinks_over_time(len(animation.vertices), animation.frame_rate, rate, seed)
     vertices = shut_lids(animation, eyes, curve)
-    return noted(animation, vertices, PROCEDURAL, blink_words(rate, seed))
+    return with_metadata(animation, vertices, PROCEDURAL, blink_words(rate, seed))
 
 
 def blink_words(rate: Amount, seed: int) -> str:
@@ -93,7 +92,7 @@ def blinks_over_time(frames: int, frame_rate: float, rate: Amount, seed: int) ->
     if not isinstance(rate, np.ndarray):
         return blink_curve(frames, frame_rate, rate=rate, seed=seed)
     highest = max(float(rate.max(initial=0.0)), 1.0)
-    return blink_curve(frames, frame_rate, rate=highest, seed=seed, kept=rate / highest)
+    return blink_curve(frames, frame_rate, rate=highest, seed=seed, chances=rate / highest)
 
 
 @ranges.checked
@@ -103,7 +102,7 @@ def blink_curve(
     *,
     rate: ranges.BlinkRate = RATE,
     seed: int = 0,
-    kept: npt.NDArray[np.floating] | None = None,
+    chances: npt.NDArray[np.floating] | None = None,
 ) -> Array:
     """How far the eyes are shut in every frame (T,), 0 to 1.
 
@@ -115,7 +114,7 @@ def blink_curve(
         frame_rate: frames a second.
         rate: blinks a minute.
         seed: of the random numbers.
-        kept: with which chance a blink is kept that begins in each frame (T,); all of them are if None.
+        chances: probability (T,) of keeping a blink that begins in a frame; all are kept if None.
 
     Example:
         >>> bool((blink_curve(250, 25.0, seed=1) == 1.0).any())
@@ -125,10 +124,10 @@ def blink_curve(
     times = np.arange(frames) / frame_rate
     last = times[-1] if frames else 0.0
     hold = max(SHUT, 1.0 / frame_rate)  # so that one frame at least falls into it
-    usual = CLOSE + hold + OPEN
-    least = usual * SPREAD[1] + GAP
+    duration = CLOSE + hold + OPEN
+    least = duration * SPREAD[1] + GAP
     # A double blink is two for one interval; the mean of all intervals from start to start stays 60 / rate.
-    mean = 60.0 * (1.0 + DOUBLE) / rate - DOUBLE * (usual + GAP)
+    mean = 60.0 * (1.0 + DOUBLE) / rate - DOUBLE * (duration + GAP)
     curve = np.zeros(frames)
     start = random.uniform(0.0, 1.0) * mean
     while start < last:
@@ -136,11 +135,11 @@ def blink_curve(
             length = float(random.uniform(*SPREAD))
             down, up = CLOSE * length, OPEN * length
             end = start + down + hold + up
-            keeps = kept is None or chance.random() < kept[min(int(start * frame_rate), frames - 1)]
+            keeps = chances is None or chance.random() < chances[min(int(start * frame_rate), frames - 1)]
             if end <= last and keeps:
                 span = slice(int(start * frame_rate), int(end * frame_rate) + 2)
-                now = times[span]
-                curve[span] = np.maximum(curve[span], smooth_step((now - start) / down) * smooth_step((end - now) / up))
+                shut = smooth_step((times[span] - start) / down) * smooth_step((end - times[span]) / up)
+                curve[span] = np.maximum(curve[span], shut)
             following, start = start, end + GAP
         start = following + least + float(random.gamma(2.0, max(mean - least, 0.05) / 2.0))
     return curve
@@ -163,10 +162,8 @@ def add_gaze(animation: Animation, eyes: Eyes, *, degrees: Amount = DEGREES_GAZE
 
     The head must not sway yet; ``degrees`` is how far from straight ahead the eyes turn at most, or that in each frame.
     """
-    if not eyes.eyeballs:
-        raise FaceDiffError(f"{eyes.source}: does not say which vertices are the eyeballs; {GIVE}")
     angles = gaze_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
-    return noted(animation, turn_eyes(animation, eyes, angles), PROCEDURAL, gaze_words(degrees, seed))
+    return with_metadata(animation, turn_eyes(animation, eyes, angles), PROCEDURAL, gaze_words(degrees, seed))
 
 
 def gaze_words(degrees: Amount, seed: int) -> str:
@@ -176,8 +173,8 @@ def gaze_words(degrees: Amount, seed: int) -> str:
 
 def gaze_over_time(frames: int, frame_rate: float, degrees: Amount, seed: int) -> Array:
     """Where the eyes look in every frame (T, 2) at a largest angle that may change from frame to frame."""
-    most, share = largest_of(degrees)
-    return np.asarray(share * gaze_curve(frames, frame_rate, degrees=most, seed=seed))
+    largest, share = largest_of(degrees)
+    return np.asarray(share * gaze_curve(frames, frame_rate, degrees=largest, seed=seed))
 
 
 def turn_eyes(animation: Animation, eyes: Eyes, angles: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
@@ -222,17 +219,17 @@ def gaze_curve(frames: int, frame_rate: float, *, degrees: ranges.GazeAngle = DE
     times = np.arange(frames) / frame_rate
     last = float(times[-1]) if frames else 0.0
     curve = np.zeros((frames, 2))
-    here, now = np.zeros(2), fixation(AHEAD_SECONDS)
-    while now < last:
-        elsewhere = not here.any() or random.random() < 0.25
-        there = somewhere() if elsewhere else np.zeros(2)
+    gaze, time = np.zeros(2), fixation(AHEAD_SECONDS)
+    while time < last:
+        elsewhere = not gaze.any() or random.random() < 0.25
+        goal = somewhere() if elsewhere else np.zeros(2)
         stay = fixation(ASIDE_SECONDS if elsewhere else AHEAD_SECONDS)
-        if now + stay >= last - SHORTEST:  # no time to come back
-            there = np.zeros(2)
-        seconds = 0.021 + 0.0022 * float(np.linalg.norm(there - here))
-        first = int(now * frame_rate)
-        curve[first:] = here + smooth_step((times[first:] - now) / seconds)[:, None] * (there - here)
-        here, now = there, now + seconds + stay
+        if time + stay >= last - SHORTEST:  # too late to return
+            goal = np.zeros(2)
+        seconds = 0.021 + 0.0022 * float(np.linalg.norm(goal - gaze))
+        first = int(time * frame_rate)
+        curve[first:] = gaze + smooth_step((times[first:] - time) / seconds)[:, None] * (goal - gaze)
+        gaze, time = goal, time + seconds + stay
     return curve
 
 
@@ -271,7 +268,7 @@ def add_sway(animation: Animation, *, degrees: Amount = DEGREES_SWAY, seed: int 
     """
     turns, shifts = sway_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
     moved = move_head(animation, turns, shifts)
-    return noted(moved, moved.vertices, PROCEDURAL, sway_words(degrees, seed))
+    return with_metadata(moved, moved.vertices, PROCEDURAL, sway_words(degrees, seed))
 
 
 def sway_words(degrees: Amount, seed: int) -> str:
@@ -280,9 +277,9 @@ def sway_words(degrees: Amount, seed: int) -> str:
 
 
 def sway_over_time(frames: int, frame_rate: float, degrees: Amount, seed: int) -> tuple[Array, Array]:
-    """Rotations and shifts (T, 3) of a sway whose largest rotation may change from frame to frame."""
-    most, share = largest_of(degrees)
-    turns, shifts = sway_curve(frames, frame_rate, degrees=most, seed=seed)
+    """Rotations and shifts (T, 3) of a sway; the largest rotation may change from frame to frame."""
+    largest, share = largest_of(degrees)
+    turns, shifts = sway_curve(frames, frame_rate, degrees=largest, seed=seed)
     return share * turns, share * shifts
 
 
@@ -290,14 +287,14 @@ def move_head(animation: Animation, turns: Array, shifts: Array) -> Animation:
     """The animation with vertices that move as one.
 
     Args:
-        animation: whose head does not move yet.
+        animation: with a head that does not move yet.
         turns: rotations about the neck (T, 3), axis-angle in radians.
         shifts: (T, 3) in head heights.
     """
     matrices = rotations(turns)
     template = np.asarray(animation.template, np.float64)
     pivot, height = neck(template), float(np.ptp(template[:, 1]))
-    vertices = room_for(animation.vertices)
+    vertices = allocate_like(animation.vertices)
     for index, frame in enumerate(animation.vertices):
         moving = turns[index].any() or shifts[index].any()  # at rest to the last bit
         vertices[index] = (frame - pivot) @ matrices[index].T + pivot + height * shifts[index] if moving else frame
@@ -340,7 +337,7 @@ def _largest(vectors: Array, size: float) -> Array:
     return vectors * (size / longest) if longest > 0 else vectors
 
 
-# What all changes to an animation have in common: arrays that may be too large for memory, and a note in the metadata.
+# Shared by all changes of an animation: arrays that may be too large for memory, and a note in the metadata.
 
 
 def moves_head(animation: Animation) -> bool:
@@ -355,8 +352,8 @@ def largest_of(amount: Amount) -> tuple[float, float | Array]:
     """The largest of an amount, and the share of it: 1, or one for each frame (T, 1)."""
     if not isinstance(amount, np.ndarray):
         return amount, 1.0
-    most = float(amount.max(initial=0.0)) or 1.0
-    return most, (np.asarray(amount, np.float64) / most)[:, None]
+    largest = float(amount.max(initial=0.0)) or 1.0
+    return largest, (np.asarray(amount, np.float64) / largest)[:, None]
 
 
 def in_words(amount: Amount) -> str:
@@ -370,7 +367,7 @@ def in_words(amount: Amount) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def room_for(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def allocate_like(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """An array of the same shape to write to: in memory, or on disk where the vertices are a memory map themselves.
 
     A file on disk lies next to the map's, or where temporary files go if that folder cannot be written, and vanishes
@@ -403,13 +400,13 @@ def _mapped(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
 
 
 def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """A copy to work on, see :func:`room_for`."""
-    copy = room_for(vertices)
+    """A copy to work on, see :func:`allocate_like`."""
+    copy = allocate_like(vertices)
     copy[:] = vertices
     return copy
 
 
-def noted(animation: Animation, vertices: npt.NDArray[np.float32], key: str, note: str) -> Animation:
+def with_metadata(animation: Animation, vertices: npt.NDArray[np.float32], key: str, note: str) -> Animation:
     """The animation with other vertices (T, V, 3), and words added to an entry of its metadata."""
     before = animation.metadata.get(key)
     entry = note if before is None else f"{before}; {note}"

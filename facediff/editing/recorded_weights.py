@@ -26,7 +26,7 @@ def read_weights(path: Path) -> Animation:
     if clip.space.kind != "arkit":
         raise FaceDiffError(f"{path}: holds {clip.space.kind} parameters; expected weights of ARKit's shapes")
     rig = built_in_rig()
-    # By ARKit's own spelling, whatever the file's.
+    # By ARKit's own spelling.
     space = replace(clip.space, channels=tuple(arkit_name(name) or name for name in clip.space.channels))
     column = {name: row for row, name in enumerate(rig.names)}
     nothing = np.zeros(rig.neutral.shape)

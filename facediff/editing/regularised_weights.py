@@ -24,7 +24,7 @@ L1, L2, TEMPORAL, SYMMETRY = 0.25, 10.0, 100.0, 10.0
 """Factors of the strengths."""
 
 EXCLUDED = 1e-10
-"""Upper bound of a weight whose partner excludes it."""
+"""Upper bound of a weight that its partner excludes."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,14 @@ class RegularisedSolver:
 
     Args:
         neutral: (V, 3) the face at rest.
-        deltas: (K, V, 3) what a weight of 1 adds.
+        deltas: (K, V, 3) displacements at a weight of 1.
         mask: vertices that are compared; all if empty.
         regularisation: strengths of the terms.
         active: (K,) which shapes are used, the weights of others are 0; all if None.
         symmetric: pairs of shapes that are a left one and a right one.
         cancel: pairs of shapes that exclude one another: of each, the smaller weight is held at nearly 0.
         multipliers: (K,) factor of each weight that was solved for; 1 if None.
-        offsets: (K,) what is added to it then; 0 if None.
+        offsets: (K,) added after the multiplication; 0 if None.
 
     Example:
         >>> neutral, deltas = np.eye(3) * 54.7, np.eye(9).reshape(9, 3, 3)[:2]
@@ -85,15 +85,14 @@ class RegularisedSolver:
         count = len(deltas)
         self.neutral, self.options = neutral, regularisation or Regularisation()
         self._rows: Any = slice(None) if mask is None or not len(mask) else np.asarray(mask, np.int64)
-        used = np.ones(count, bool) if active is None else np.asarray(active, bool)
-        self._used = np.flatnonzero(used)
+        self._used = np.arange(count) if active is None else np.flatnonzero(np.asarray(active, bool))
         self._factor = np.ones(count) if multipliers is None else np.asarray(multipliers, np.float64)
         self._offset = np.zeros(count) if offsets is None else np.asarray(offsets, np.float64)
-        place = {int(shape): index for index, shape in enumerate(self._used)}
+        row = {int(shape): index for index, shape in enumerate(self._used)}
         # A pair counts only if both of its shapes are used.
-        pairs = [[(place[i], place[j]) for i, j in group if i in place and j in place] for group in (symmetric, cancel)]
+        pairs = [[(row[i], row[j]) for i, j in group if i in row and j in row] for group in (symmetric, cancel)]
         self._cancel = pairs[1]
-        # The size of the whole face, whatever the mask leaves out.
+        # The size of the whole face, also of vertices outside of the mask.
         self._scale = float(np.square(np.ptp(neutral.astype(np.float64), axis=0)).sum()) / self.options.template_size**2
         self._shapes = deltas[self._used][:, self._rows].reshape(len(self._used), -1).astype(np.float64)
         self._matrix = self._shapes @ self._shapes.T + self._scale * self._penalty(pairs[0])
@@ -128,20 +127,20 @@ class RegularisedSolver:
         if not self._cancel:
             return weights
         # Of two shapes that exclude one another the stronger is kept, and all others are solved for again without the
-        # weaker one, whose share they then take over. Its bound is not quite 0, which the published solver needs.
+        # weaker one, to take over its share. Its bound is not quite 0, which the published solver needs.
         for i, j in self._cancel:
             upper[j if weights[i] >= weights[j] else i] = EXCLUDED
         return least_squares(self._matrix, right, lower, upper, weights)
 
 
 def pairs_of(partners: Sequence[int]) -> list[tuple[int, int]]:
-    """Pairs of places with the same number, not negative.
+    """Pairs of indices with the same number, not negative.
 
     >>> pairs_of([0, -1, 1, 0, 1])
     [(0, 3), (2, 4)]
     """
-    places: dict[int, list[int]] = {}
-    for place, number in enumerate(partners):
+    indices: dict[int, list[int]] = {}
+    for index, number in enumerate(partners):
         if number >= 0:
-            places.setdefault(number, []).append(place)
-    return [(pair[0], pair[1]) for pair in places.values() if len(pair) == 2]
+            indices.setdefault(number, []).append(index)
+    return [(pair[0], pair[1]) for pair in indices.values() if len(pair) == 2]

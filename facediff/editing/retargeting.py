@@ -31,7 +31,7 @@ from facediff.editing.lids import swing, with_lids, without_lids
 from facediff.editing.placing import place_face
 from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, damaged
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.parts import mesh_parts, named_triangles
@@ -56,10 +56,10 @@ def retarget(
     landmarks_path: Path | None = None,
     *,
     parts: Sequence[str] = (),
-    judge: Callable[[Animation, Correspondence, FitReport], object] | None = None,
+    check: Callable[[Animation, Correspondence, FitReport], object] | None = None,
     whole_head: bool = False,
 ) -> tuple[Animation, Correspondence]:
-    """An animation on the mesh in a file, and the correspondence between both meshes; :func:`upright` if z is up in it.
+    """An animation on the mesh in a file, and the correspondence between both meshes; :func:`to_y_up` if z is up in it.
 
     Args:
         animation: with triangles.
@@ -68,20 +68,20 @@ def retarget(
         landmarks_path: CSV or JSON of landmarks, for a correspondence that does not exist yet.
         parts: names of the parts of the file that show the face, see :func:`facediff.mesh.parts.named_triangles`; it is
             searched for in all of them if there are none.
-        judge: called with the result in the mesh's own axes and what was measured of it, before a new correspondence is
+        check: called with the result in the mesh's own axes and what was measured of it, before a new correspondence is
             written; raises where it should not be. Where it raises and both meshes are of known topologies, their named
             landmarks are tried. Nothing is measured if None.
-        whole_head: as of :func:`carry`.
+        whole_head: as of :func:`transfer`.
     """
     triangles = animation.triangles  # refuses an animation without triangles before the other mesh is read
     mesh = read_mesh(mesh_path)
 
-    def judged(correspondence: Correspondence) -> tuple[Animation, Correspondence]:
-        if judge is None:
-            return upright(carry(animation, correspondence, mesh, whole_head), correspondence), correspondence
-        carried, correspondence, report = carry_checked(animation, correspondence, mesh, whole_head)
-        judge(carried, correspondence, report)
-        return upright(carried, correspondence), correspondence
+    def checked_transfer(correspondence: Correspondence) -> tuple[Animation, Correspondence]:
+        if check is None:
+            return to_y_up(transfer(animation, correspondence, mesh, whole_head), correspondence), correspondence
+        carried, correspondence, report = transfer_checked(animation, correspondence, mesh, whole_head)
+        check(carried, correspondence, report)
+        return to_y_up(carried, correspondence), correspondence
 
     if correspondence_path is not None and correspondence_path.exists():
         if landmarks_path is not None or parts:
@@ -94,24 +94,24 @@ def retarget(
             str(mesh_path), mesh.vertices, mesh.faces, correspondence.target_vertices, correspondence.target_faces
         )
         refuse_other_face(str(mesh_path), mesh.vertices, correspondence.target_vertices)
-        return judged(correspondence)
+        return checked_transfer(correspondence)
     if correspondence_path is not None:
         check_writable(correspondence_path)
     # Everything that can be wrong with the options is found before the meshes are compared, which takes seconds.
     landmarks = None
     if landmarks_path is not None:
-        both = known_topology(animation.template), known_topology(mesh.vertices)
-        landmarks = read_landmarks(landmarks_path, *both, (len(animation.template), len(mesh.vertices)))
-    shown = named_triangles(mesh_path, parts) if parts else None
+        templates = known_topology(animation.template), known_topology(mesh.vertices)
+        landmarks = read_landmarks(landmarks_path, *templates, (len(animation.template), len(mesh.vertices)))
+    face_triangles = named_triangles(mesh_path, parts) if parts else None
 
     def attempt(marks: Landmarks | None) -> tuple[Animation, Correspondence]:
         try:
             correspondence = correspond(
-                animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, shown=shown
+                animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, face_triangles=face_triangles
             )
         except FaceDiffError as error:
             raise FaceDiffError(f"{mesh_path}: {error}") from error
-        return judged(correspondence)
+        return checked_transfer(correspondence)
 
     try:
         try:
@@ -119,18 +119,16 @@ def retarget(
         except FaceDiffError:
             # Named landmarks come second: a good fit needs none, and they are only known to a vertex, so that they
             # would pull at it.
-            named = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
-            if named is None or judge is None:
+            common = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
+            if common is None or check is None:
                 raise
-            carried, correspondence = attempt(named)
+            carried, correspondence = attempt(common)
     except FaceDiffError as error:
         names = [] if parts else parts_with_a_face(animation, mesh_path, mesh)
         if not names:
             raise
         hint = f". A face was found in these of its parts: {', '.join(names)}; try {{part}} {names[0]}"
-        if isinstance(error, OptionError):
-            raise error.followed_by(hint) from error
-        raise OptionError.naming(f"{error}{hint}") from error
+        raise error.followed_by(hint) from error
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)
     return carried, correspondence
@@ -142,7 +140,7 @@ def has_z_up(correspondence: Correspondence) -> bool:
     return bool(cosine > np.cos(TILT))
 
 
-def upright(carried: Animation, correspondence: Correspondence) -> Animation:
+def to_y_up(carried: Animation, correspondence: Correspondence) -> Animation:
     """An animation on a target mesh with y up, as animations have it, where the mesh has z up; else the same."""
     return turned(carried, Z_UP.T) if has_z_up(correspondence) else carried
 
@@ -182,7 +180,7 @@ def parts_with_a_face(animation: Animation, path: Path, mesh: Mesh) -> list[str]
     return names
 
 
-def carry_checked(
+def transfer_checked(
     animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False
 ) -> tuple[Animation, Correspondence, FitReport]:
     """The motion of an animation on a target mesh, the correspondence that carried it, and what was measured of it.
@@ -190,22 +188,22 @@ def carry_checked(
     Where a result is poor, its eyes are carried another way: lids go the share of their own opening, if they did not
     yet, and else stay at rest. That result counts if nothing else is wrong.
     """
-    carried = carry(animation, correspondence, target, whole_head)
+    carried = transfer(animation, correspondence, target, whole_head)
     report = check_fit(animation, carried, correspondence)
     faults = report.faults
     for lids in (LIDS_FITTED, LIDS_AT_REST):
         if report.good or report.eyes is None or correspondence.lids >= lids:
             continue
-        other = replace(correspondence, lids=lids)
-        moved = carry(animation, other, target, whole_head)
-        again = check_fit(animation, moved, other)
+        variant = replace(correspondence, lids=lids)
+        moved = transfer(animation, variant, target, whole_head)
+        again = check_fit(animation, moved, variant)
         if again.good:
             why = [f"lids in motion were worse: {faults[0]}"] if lids == LIDS_AT_REST else []
-            return moved, other, replace(again, remarks=(*again.remarks, *why))
+            return moved, variant, replace(again, remarks=(*again.remarks, *why))
     return carried, correspondence, report
 
 
-def carry(animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False) -> Animation:
+def transfer(animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False) -> Animation:
     """The motion of an animation of the correspondence's source mesh, of any identity, on its target mesh.
 
     The target's vertices, triangles and colours are kept as they are; its unit follows from how large it is.
@@ -235,7 +233,7 @@ def carry(animation: Animation, correspondence: Correspondence, target: Mesh, wh
     step = max(1, CHUNK_BYTES // (24 * max(len(rest), len(neutral))))
     for first in range(0, len(vertices), step):
         some = slice(first, first + step)
-        vertices[some] = rest + carry_displacements(
+        vertices[some] = rest + transfer_displacements(
             correspondence, np.asarray(animation.vertices[some], np.float64) - neutral
         )
     head = None if head is None else _carried_head(vertices, rest, head, correspondence, whole_head)
@@ -263,28 +261,32 @@ NECK = 0.5  # Below a head, its motion as a whole fades over this share of the s
 
 
 def _carried_head(
-    vertices: npt.NDArray[np.float32], rest: Array, head: Array, correspondence: Correspondence, whole: bool
+    vertices: npt.NDArray[np.float32], rest: Array, head: Array, correspondence: Correspondence, whole_head: bool
 ) -> Array | None:
     """Move vertices (T, V, 3) as a head does, eyes and hair included; the motion (T, 6), if all of them move so."""
-    own = correspondence.similarity
-    turns = head[:, :3] @ own.rotation.T  # axes turn with the mesh
+    similarity = correspondence.similarity
+    turns = head[:, :3] @ similarity.rotation.T  # axes turn with the mesh
     matrices = rotations(turns)
-    shifts = own.scale * head[:, 3:] @ own.rotation.T + own.translation - matrices @ own.translation
-    height = own.inverse().apply(rest)[:, 1]
+    shifts = (
+        similarity.scale * head[:, 3:] @ similarity.rotation.T
+        + similarity.translation
+        - matrices @ similarity.translation
+    )
+    height = similarity.inverse().apply(rest)[:, 1]
     low, high = correspondence.source_vertices[:, 1].min(), correspondence.source_vertices[:, 1].max()
     # A figure's head turns on its neck: below the source's lowest vertex the turn fades, and its feet stay put.
     share = np.clip(1.0 + (height - low) / (NECK * (high - low)), 0.0, 1.0)
     # Carried back, the lowest vertex may lie a rounding below its own height.
-    whole = whole or bool((share > 0.999).all())
+    whole_head = whole_head or bool((share > 0.999).all())
     for frame, matrix, shift, motion in zip(vertices, matrices, shifts, head, strict=True):
         if motion.any():
             moved = frame @ matrix.T + shift
-            frame[:] = moved if whole else frame + share[:, None] * (moved - frame)
+            frame[:] = moved if whole_head else frame + share[:, None] * (moved - frame)
     shifts[~head.any(axis=1)] = 0.0
-    return np.concatenate([turns, shifts], axis=1) if whole else None
+    return np.concatenate([turns, shifts], axis=1) if whole_head else None
 
 
-def carry_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:
+def transfer_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:
     """Displacements of the source's vertices (T, Vs, 3) as those of the target's (T, Vt, 3), in its unit and axes.
 
     Each target vertex takes the weighted mean of its triangle's corners, turned and scaled by the similarity. Where
@@ -369,7 +371,7 @@ def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer])
     nearest to one another: on a coarse mesh the very nearest ones may lie far apart.
     """
     source = Surface(correspondence.source_vertices, correspondence.source_faces)
-    shown = np.einsum("vc,vcd->vd", correspondence.weights, source.vertices[correspondence.corners])
+    points = np.einsum("vc,vcd->vd", correspondence.weights, source.vertices[correspondence.corners])
     sides = sides_of_pairs(source.vertices, source.faces, np.asarray(pairs, np.int64))
     side = (correspondence.weights * sides[correspondence.corners]).sum(axis=1)
     rest = correspondence.similarity.inverse().apply(correspondence.target_vertices)
@@ -378,7 +380,7 @@ def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer])
     for row, ends in enumerate(np.asarray(pairs)):
         # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same.
         above, below = (
-            np.linalg.norm(shown - source.vertices[vertex], axis=1)
+            np.linalg.norm(points - source.vertices[vertex], axis=1)
             + source.size * (sign * side <= 0)
             + source.size * (correspondence.share <= 0)
             for vertex, sign in zip(ends, (1.0, -1.0), strict=True)
@@ -412,16 +414,16 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
                 break
             neutral, points = back.apply(neutral), back.apply(points)
             faces = _about_what_moves(neutral, points, faces)
-        used, corners = np.unique(faces, return_inverse=True)
+        vertices, corners = np.unique(faces, return_inverse=True)
         corners = corners.reshape(-1, 3)
-        correspondence = correspond(neutral[used], corners, template, animation.triangles)
+        correspondence = correspond(neutral[vertices], corners, template, animation.triangles)
         # Shapes state no unit; the alignment says how large they are.
         metres = correspondence.similarity.scale * metres_per_unit(animation.unit)
-        shown = Animation(
-            str(path), points[:, used].astype(np.float32), neutral[used].astype(np.float32), 1.0,
+        shape_poses = Animation(
+            str(path), points[:, vertices].astype(np.float32), neutral[vertices].astype(np.float32), 1.0,
             faces=corners.astype(np.int32), unit=f"{metres:.9g}",
         )  # fmt: skip
-        reports.append(check_fit(shown, carry(shown, correspondence, goal), correspondence))
+        reports.append(check_fit(shape_poses, transfer(shape_poses, correspondence, goal), correspondence))
         if reports[-1].good:
             break
     if not reports[-1].good:
@@ -429,14 +431,14 @@ def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:
             f"{path}: its shapes cannot be carried to {animation.name}: {reports[0].faults[0]}. Carry the animation to "
             f"their mesh with `facediff retarget`, and give them without {{carry}}"
         )
-    moves = carry_displacements(correspondence, points[:, used] - neutral[used])
+    moves = transfer_displacements(correspondence, points[:, vertices] - neutral[vertices])
     moved = replace(
         files,
         shapes=template + moves,
         neutral=template,
         faces=animation.faces,
         metric=False,
-        notes=(*files.notes, f"the shapes are transferred from a mesh of {len(used)} vertices"),
+        notes=(*files.notes, f"the shapes are transferred from a mesh of {len(vertices)} vertices"),
     )
     return fitted(moved, animation.template, animation.unit)
 
@@ -452,8 +454,8 @@ def _about_what_moves(neutral: Array, points: Array, faces: Indices) -> Indices:
         return faces
     margin = ABOUT_MOVING * float(np.ptp(moving, axis=0).max())
     inside = ((neutral >= moving.min(axis=0) - margin) & (neutral <= moving.max(axis=0) + margin)).all(axis=1)
-    kept = faces[inside[faces].all(axis=1)]
-    return kept if len(kept) >= 4 else faces
+    near = faces[inside[faces].all(axis=1)]
+    return near if len(near) >= 4 else faces
 
 
 # Correspondences on disk.
@@ -494,20 +496,23 @@ def save_correspondence(path: Path, correspondence: Correspondence) -> None:
 
 def load_correspondence(path: Path) -> Correspondence:
     """Read what :func:`save_correspondence` wrote."""
-    held = read_arrays(path)
-    check_format(path, str(held.get("format")), FORMAT)
-    for name, (kind, axes) in {**ARRAYS, **SIMILARITY}.items():
-        array = held.get(name, np.array(None))
-        if array.dtype.kind != kind or array.ndim != axes or not np.isfinite(array).all():
-            raise FaceDiffError(f"{path}: its {name} are damaged; make a new correspondence")
-    correspondence = Correspondence(
-        **{name: held[name] for name in ARRAYS if name != "lids"},
-        lids=int(held["lids"]),
-        similarity=Similarity(held["rotation"], held["translation"], float(held["scale"])),
-    )
-    if not _consistent(correspondence):
-        raise FaceDiffError(f"{path}: its parts do not fit one another; make a new correspondence")
+    arrays = read_arrays(path)
+    check_format(path, str(arrays.get("format")), FORMAT)
+    with damaged(path, "make a new correspondence"):
+        kinds = {**ARRAYS, **SIMILARITY}
+        unfit = [name for name, (kind, axes) in kinds.items() if not _is_array(arrays[name], kind, axes)]
+        correspondence = Correspondence(
+            **{name: arrays[name] for name in ARRAYS if name != "lids"},
+            lids=int(arrays["lids"]),
+            similarity=Similarity(arrays["rotation"], arrays["translation"], float(arrays["scale"])),
+        )
+        if unfit or not _consistent(correspondence):
+            raise ValueError(f"{' and '.join(unfit) or 'its arrays'} are damaged or do not match one another")
     return correspondence
+
+
+def _is_array(array: npt.NDArray[np.generic], kind: str, axes: int) -> bool:
+    return array.dtype.kind == kind and array.ndim == axes and bool(np.isfinite(array).all())  # type: ignore[call-overload]
 
 
 def _consistent(parts: Correspondence) -> bool:

@@ -10,15 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, damaged
 from facediff.mesh import face_size, robust_align
-from facediff.spaces.arkit import absent_from, arkit_name, beyond_arkit
+from facediff.spaces.arkit import absent_from, beyond_arkit
 from facediff.spaces.shape_files import ShapeFiles, read_shape_files
 
 Array = npt.NDArray[np.float64]
 
 ANOTHER_ORDER = 0.3
-"""Neutral faces whose vertices lie further apart than this share of the face's size are not in the same order."""
+"""Vertices of neutral faces further apart than this share of the face's size are not in the same order."""
 ANOTHER_FACE, ENOUGH = 0.01, 8
 """Without a neutral face, so many shapes may have no more than this share of the face's size in common: each moves a
 part of its own, so that their median is the face at rest that they were made from."""
@@ -35,7 +35,7 @@ class ShapeSet:
         names: K names; ARKit's own spelling where they are ARKit's.
         neutral: (V, 3) the face at rest, in the animation's unit.
         deltas: (K, V, 3) displacement of each vertex at weight 1.
-        notes: what was found and changed on reading, a sentence each.
+        notes: findings and changes on reading, a sentence each.
     """
 
     names: tuple[str, ...]
@@ -60,21 +60,21 @@ class ShapeSet:
         return tuple(n for n, delta in zip(self.names, self.deltas, strict=True) if np.abs(delta).max() <= least)
 
     def only(self, names: Sequence[str]) -> ShapeSet:
-        """The set without all other names; refused if nothing would be left."""
-        kept = [index for index, name in enumerate(self.names) if name in names]
-        if not kept:
+        """The set without all other names; refused if it would be empty."""
+        indices = [index for index, name in enumerate(self.names) if name in names]
+        if not indices:
             raise FaceDiffError(
                 f"shapes: {', '.join(self.names[:4])}{' …' if len(self.names) > 4 else ''} are none of "
                 f"{', '.join(names[:4])} …, which the table has columns for; name them so, or write a plain table"
             )
-        return replace(self, names=tuple(self.names[index] for index in kept), deltas=self.deltas[kept])
+        return replace(self, names=tuple(self.names[index] for index in indices), deltas=self.deltas[indices])
 
 
-KEPT = "not ARKit's, kept as channels of their own"
-"""How the note on names that are not ARKit's begins."""
+EXTRA_NOTE = "not ARKit's, kept as channels of their own"
+"""Begin of the note on names that are not ARKit's."""
 
 BUILT_IN = "puppet"
-"""What users give in place of a folder or file for the shapes of the built-in face."""
+"""Name of the built-in face's shapes, in place of a folder or file."""
 
 
 def is_built_in(path: Path) -> bool:
@@ -96,7 +96,7 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
     Args:
         path: a folder of ``.obj`` or ``.ply`` files named as their shapes are, the face at rest among them as
             ``neutral`` or ``Basis`` (without one, the template is the face at rest), a ``.glb`` with named targets, or
-            ``puppet`` for those of the built-in face, whose speaker with the nearest face they are taken from.
+            ``puppet`` for the built-in shapes of the speaker with the nearest face.
         template: (V, 3) the animation's neutral face.
         unit: the template's unit of length.
     """
@@ -120,8 +120,8 @@ def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m
         matrix = lay_onto(files, goal, notes, unit)
         return _named(files, goal, (files.shapes - files.neutral) @ matrix.T, notes)
     deltas = files.shapes / (metres_per_unit(unit) if files.metric else 1.0) - goal
-    # A median that moves is another neutral face, which all shapes were made from: its difference from the template
-    # would be solved for in every frame.
+    # A median that moves is the neutral face of these shapes: its difference from the template would be solved for in
+    # every frame.
     common = np.median(deltas, axis=0) if len(deltas) >= ENOUGH else np.zeros_like(goal)
     size, least = face_size(goal), np.sqrt(np.square(deltas).sum(-1).mean(-1)).min()
     if np.sqrt(np.square(common).sum(-1).mean()) > ANOTHER_FACE * size or least > ANOTHER_ORDER * size:
@@ -134,21 +134,19 @@ def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m
 
 
 def lay_onto(files: ShapeFiles, goal: Array, notes: list[str], unit: str) -> Array:
-    """The (3, 3) rotation and scale from the files' face at rest to the template's; adds what it did to the notes."""
+    """The (3, 3) rotation and scale from the files' face at rest to the template's; adds them to the notes."""
     neutral = np.asarray(files.neutral, np.float64)
     factor = 1.0 / metres_per_unit(unit) if files.metric else 1.0
     rest = files.first.parent / files.rest
-    try:
+    with damaged(rest, "give the face at rest of these shapes"):
         similarity = robust_align(neutral * factor, goal, scale=True)
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{rest}: cannot be aligned with the animation's face: {error}") from error
     apart = np.linalg.norm(similarity.apply(neutral * factor) - goal, axis=1)
     if np.median(apart) > ANOTHER_ORDER * face_size(goal):
         raise OptionError.naming(
             f"{rest}: has the vertices of the animation's template in another order; write it again with the order "
             f"kept (Blender: import and export with vertex order), or use {{carry}}"
         )
-    # A small difference in size or pose is another speaker's head, whose movements are used as they are.
+    # A small difference in size or pose is another speaker's head; its displacements are used unchanged.
     scale = similarity.scale if not 1 / SAME_SIZE < similarity.scale < SAME_SIZE else 1.0
     angle = float(np.arccos(np.clip((np.trace(similarity.rotation) - 1) / 2, -1, 1)))
     if scale != 1.0:
@@ -161,17 +159,9 @@ def lay_onto(files: ShapeFiles, goal: Array, notes: list[str], unit: str) -> Arr
 
 def _named(files: ShapeFiles, neutral: Array, deltas: Array, notes: list[str]) -> ShapeSet:
     """The set under ARKit's names where there are such."""
-    names: dict[str, str] = {}
-    for name in files.names:
-        own_name = arkit_name(name) or name
-        if own_name in names:
-            raise FaceDiffError(f'{files.path}: "{names[own_name]}" and "{name}" are both {own_name}; keep one of them')
-        names[own_name] = name
-    shape_set = ShapeSet(tuple(names), neutral, np.ascontiguousarray(deltas))
-    if not np.isfinite(shape_set.deltas).all():
-        raise FaceDiffError(f"{files.path}: a shape holds NaN or infinity; write it again")
+    shape_set = ShapeSet(files.arkit_names, neutral, np.ascontiguousarray(deltas))
     if shape_set.extra:
-        notes.append(f"{KEPT}: {', '.join(shape_set.extra)}")
+        notes.append(f"{EXTRA_NOTE}: {', '.join(shape_set.extra)}")
     if shape_set.still:
         notes.append(f"move no vertex, so that their weights stay 0: {', '.join(shape_set.still)}")
     return replace(shape_set, notes=tuple(notes))

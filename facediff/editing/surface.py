@@ -62,8 +62,8 @@ class Surface:
 
         centres = self.triangles.mean(axis=1)
         radii = np.linalg.norm(self.triangles - centres[:, None], axis=2).max(axis=1)
-        most = max(float(radii.max()), np.finfo(float).tiny)
-        octave = np.floor(np.log2(np.maximum(radii / most, 2.0**-10)))
+        largest = max(float(radii.max()), np.finfo(float).tiny)
+        octave = np.floor(np.log2(np.maximum(radii / largest, 2.0**-10)))
         groups = [np.flatnonzero(octave == one) for one in np.unique(octave)]
         return centres, radii, [(faces, cKDTree(centres[faces])) for faces in groups]
 
@@ -108,8 +108,8 @@ def nearest(surface: Surface, points: Array, normals: Array, size: float | None 
         )
     corners = surface.faces[faces]
     where = np.einsum("nc,ncd->nd", weights, surface.vertices[corners])
-    there = _unit(np.einsum("nc,ncd->nd", weights, surface.normals[corners]))
-    return Nearest(corners, weights, where, there, np.linalg.norm(points - where, axis=1), cosines)
+    normals_there = _unit(np.einsum("nc,ncd->nd", weights, surface.normals[corners]))
+    return Nearest(corners, weights, where, normals_there, np.linalg.norm(points - where, axis=1), cosines)
 
 
 def _best(surface: Surface, points: Array, normals: Array, slack: float) -> tuple[Indices, Array, Array]:
@@ -120,8 +120,8 @@ def _best(surface: Surface, points: Array, normals: Array, slack: float) -> tupl
         some = slice(first, first + step)
         point, face = _candidates(surface, points[some], slack)
         shares, square = closest_on_triangles(points[some][point], surface.triangles[face])
-        there = _unit(np.einsum("nc,ncd->nd", shares, surface.normals[surface.faces[face]]))
-        cosine = np.einsum("nd,nd->n", there, normals[some][point])
+        normals_there = _unit(np.einsum("nc,ncd->nd", shares, surface.normals[surface.faces[face]]))
+        cosine = np.einsum("nd,nd->n", normals_there, normals[some][point])
         wrong = np.clip((FACING - cosine) / (FACING - AWAY), 0.0, 1.0)
         # The distance decides; a sheet that faces away costs the slack, and between equal distances the normal decides.
         cost = np.sqrt(square) + slack * wrong + TIE * surface.balls[1][face] * (1.0 - cosine)
@@ -142,8 +142,8 @@ def _candidates(surface: Surface, points: Array, slack: float) -> tuple[Indices,
         near = tree.query_ball_point(points, limit + radii[faces].max())
         point = np.repeat(np.arange(len(points)), [len(some) for some in near])
         face = faces[np.fromiter(itertools.chain.from_iterable(near), np.int64)]
-        kept = np.linalg.norm(points[point] - centres[face], axis=1) - radii[face] <= limit[point]
-        pairs.append((point[kept], face[kept]))
+        near_enough = np.linalg.norm(points[point] - centres[face], axis=1) - radii[face] <= limit[point]
+        pairs.append((point[near_enough], face[near_enough]))
     point, face = (np.concatenate(part) for part in zip(*pairs, strict=True))
     return point, face
 

@@ -11,7 +11,7 @@ Array = npt.NDArray[np.float64]
 
 SAMPLES = 3000  # Vertices that are mirrored, at most
 ROUNDS = 25
-KEPT = 0.8  # Share of the nearest pairs that counts, so that what one side alone has does not
+INLIERS = 0.8  # Share of the nearest pairs that counts, without details of one side alone
 SETTLED = 1e-9
 
 
@@ -41,8 +41,8 @@ def symmetry_plane(vertices: npt.NDArray[np.floating], start: Plane) -> Plane:
     Example:
         >>> points = np.random.default_rng(0).normal(size=(500, 3)) * [1, 2, 3]
         >>> both = np.concatenate([points, points * [-1, 1, 1]]) + [5, 0, 0]
-        >>> found = symmetry_plane(both, Plane(np.array([0.98, 0.2, 0.0]), 4.5))
-        >>> found.normal.round(6).tolist(), round(found.offset, 6)
+        >>> plane = symmetry_plane(both, Plane(np.array([0.98, 0.2, 0.0]), 4.5))
+        >>> plane.normal.round(6).tolist(), round(plane.offset, 6)
         ([1.0, 0.0, 0.0], 5.0)
     """
     from scipy.spatial import cKDTree
@@ -54,9 +54,9 @@ def symmetry_plane(vertices: npt.NDArray[np.floating], start: Plane) -> Plane:
     plane = start
     for _ in range(ROUNDS):
         away, index = tree.query(plane.mirror(some))
-        # What has no mirror image, such as a parting or a scar, must not turn the plane.
-        kept = away <= np.quantile(away, KEPT)
-        first, second = some[kept], points[index[kept]]
+        # Points without a mirror image, as of a parting or a scar, must not turn the plane.
+        inliers = away <= np.quantile(away, INLIERS)
+        first, second = some[inliers], points[index[inliers]]
         centre = 0.5 * (first.mean(axis=0) + second.mean(axis=0))
         product = (first - first.mean(axis=0)).T @ (second - second.mean(axis=0))
         normal = np.linalg.eigh(product + product.T)[1][:, 0]

@@ -23,24 +23,23 @@ def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPh
     none.
     """
     if not any(letter.isalpha() for letter in text) or len(text) > MOST_CHARACTERS:
-        raise OptionError.naming(
-            f"{{transcript}}: has {len(text)} characters; expected English words, at most {MOST_CHARACTERS}"
+        raise OptionError(
+            "transcript", f"has {len(text)} characters; expected English words, at most {MOST_CHARACTERS}"
         )
     synthetic, voiced = spoken_by_machine(text)
     steps = max(2, int(len(speech) / SAMPLE_RATE * RATE))
-    spoken = np.flatnonzero(openness(speech, steps, RATE, EnergyGate(lead=0.02, attack=0.0, hold=0.02, release=0.0)))
-    if not len(spoken):
-        raise OptionError.naming("{transcript}: the recording has no speech; omit it, or give another recording")
-    # Only the stretch with speech is aligned: silence around it would be spread over the first and the last sound.
-    first, last = int(spoken[0]), int(spoken[-1]) + 1
-    recorded = speech[round(first / RATE * SAMPLE_RATE) : round(last / RATE * SAMPLE_RATE)]
+    active = np.flatnonzero(openness(speech, steps, RATE, EnergyGate(lead=0.02, attack=0.0, hold=0.02, release=0.0)))
     begin, end = voiced[0].start, voiced[-1].end
-    pace = (end - begin) * RATE / len(spoken)  # pauses aside, nobody speaks so much faster or slower
-    if not 1 / OTHER_PACE < pace < OTHER_PACE:
-        raise OptionError.naming(
-            f"{{transcript}}: takes {end - begin:.1f} s to say, and the recording has {len(spoken) / RATE:.1f} s of "
-            f"speech; expected all words of this recording"
+    # Pauses aside, people do not speak so much faster or slower.
+    if not len(active) or not 1 / OTHER_PACE < (end - begin) * RATE / len(active) < OTHER_PACE:
+        raise OptionError(
+            "transcript",
+            f"takes {end - begin:.1f} s to say, and the recording has {len(active) / RATE:.1f} s of speech; expected "
+            f"all words of this recording",
         )
+    # Only the stretch with speech is aligned: silence around it would be spread over the first and the last sound.
+    first, last = int(active[0]), int(active[-1]) + 1
+    recorded = speech[round(first / RATE * SAMPLE_RATE) : round(last / RATE * SAMPLE_RATE)]
     synthetic = synthetic[round(begin * SAMPLE_RATE) : round(end * SAMPLE_RATE)]
     path = align_features(
         *(cepstra(wave, max(2, int(len(wave) / SAMPLE_RATE * RATE)), RATE) for wave in (synthetic, recorded))
@@ -48,8 +47,8 @@ def align_transcript(text: str, speech: npt.NDArray[np.float32]) -> list[TimedPh
 
     def recorded_time(seconds: float) -> float:
         """The time in the recording of a time in the synthesised speech."""
-        place = np.interp((seconds - begin) * RATE, np.arange(len(path)) + 0.5, path + 0.5)
-        return float(first + place) / RATE
+        step = np.interp((seconds - begin) * RATE, np.arange(len(path)) + 0.5, path + 0.5)
+        return float(first + step) / RATE
 
     aligned = [TimedPhoneme(recorded_time(sound.start), recorded_time(sound.end), sound.ipa) for sound in voiced]
     return [sound for sound in aligned if sound.end > sound.start]

@@ -61,7 +61,7 @@ class Archive(Format):
         space = FileSpace.of(animation, options)
         if options.output_unit is not None:
             vertices = np.stack(list(space.frames(animation)))
-            head, own = animation.head, animation
+            head, original = animation.head, animation
             animation = replace(
                 animation,
                 vertices=vertices,
@@ -69,9 +69,9 @@ class Archive(Format):
                 unit=space.unit,
                 head=None if head is None else head * np.repeat([1.0, space.factor], 3),
             )
-            if own.values is not None:
-                deltas = None if own.deltas is None else own.deltas * space.factor
-                animation = animation.made_of(own.space, own.values, deltas)
+            if original.values is not None:
+                deltas = None if original.deltas is None else original.deltas * space.factor
+                animation = animation.made_of(original.space, original.values, deltas)
         write_archive(path, animation if not options.no_speech else replace(animation, speech=None))
 
 
@@ -116,15 +116,15 @@ class BeatWeights(_Weights):
         """Write the weights that there are; those that are absent are not written as 0."""
         (animation,) = animations
         weights = _arkit_weights(animation, options)
-        absent = {*weights.absent, *(animation.space.absent if options.shapes is None else ())}
-        kept = [index for index, name in enumerate(weights.names) if name not in absent]
-        names = tuple(weights.names[index] for index in kept)
-        space = replace(layout("arkit"), channels=names, absent=tuple(name for name in ARKIT if name in absent))
-        write_beat(path, ParameterClip(path.stem, weights.values[:, kept].astype("f4"), space, weights.frame_rate))
+        unknown = {*weights.absent, *(animation.space.absent if options.shapes is None else ())}
+        columns = [index for index, name in enumerate(weights.names) if name not in unknown]
+        names = tuple(weights.names[index] for index in columns)
+        space = replace(layout("arkit"), channels=names, absent=tuple(name for name in ARKIT if name in unknown))
+        write_beat(path, ParameterClip(path.stem, weights.values[:, columns].astype("f4"), space, weights.frame_rate))
 
 
 def _arkit_weights(animation: Animation, options: ExportOptions) -> Weights:
-    """The animation's own weights, or those of the shapes that the options name, on the built-in face of its own."""
+    """The animation's own weights, or weights of the shapes in the options; by default of the built-in shapes."""
     from facediff.editing.blendshapes import SolveOptions, own_weights, solve
     from facediff.editing.shapes import BUILT_IN, read_shapes
 

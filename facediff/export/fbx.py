@@ -13,7 +13,7 @@ from facediff.animation import Animation
 from facediff.errors import FaceDiffError
 
 SCRIPT = Path(__file__).with_name("glb_to_fbx.py")
-"""What Blender runs."""
+"""The script for Blender."""
 PROGRAM, MODULE = "blender", "bpy"
 
 
@@ -26,12 +26,12 @@ def command() -> list[str] | None:
 
 
 def refuse_without_blender(path: Path) -> None:
-    """Refuse a file that nothing here can write."""
+    """Refuse a file if Blender is missing."""
     if command() is None:
-        words = f"{PROGRAM} --background --python {SCRIPT.name} -- {path.stem}.glb {path.name}"
+        call = f"{PROGRAM} --background --python {SCRIPT.name} -- {path.stem}.glb {path.name}"
         raise FaceDiffError(
             f"{path}: Blender writes .fbx, and there is no program {PROGRAM} here; install it, or write "
-            f"{path.stem}.glb and run `{words}` with {SCRIPT}"
+            f"{path.stem}.glb and run `{call}` with {SCRIPT}"
         )
 
 
@@ -49,13 +49,13 @@ def write_fbx(
     """
     refuse_without_blender(path)
     glb, *wav = write_glb(folder / f"{path.stem}.glb")
-    made = folder / path.name
-    rate = f"{animation.frame_rate:.9g}", f"{len(animation.vertices)}"
-    words = [*(command() or []), str(glb), str(made), "--frame-rate", rate[0], "--frames", rate[1]]
-    done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603
-    if done.returncode != 0 or not made.is_file():
-        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
+    fbx = folder / path.name
+    rate, frames = f"{animation.frame_rate:.9g}", f"{len(animation.vertices)}"
+    arguments = [*(command() or []), str(glb), str(fbx), "--frame-rate", rate, "--frames", frames]
+    process = subprocess.run(arguments, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603
+    if process.returncode != 0 or not fbx.is_file():
+        last_line = (process.stderr.strip() or process.stdout.strip() or "no output").splitlines()[-1]
         raise FaceDiffError(
-            f"{path}: {words[0]} ended with status {done.returncode} ({said[:200]}); run {SCRIPT} by hand"
+            f"{path}: {arguments[0]} ended with status {process.returncode} ({last_line[:200]}); run {SCRIPT} by hand"
         )
-    return [made] if sound is None else [made, wav[0].rename(folder / sound)]
+    return [fbx] if sound is None else [fbx, wav[0].rename(folder / sound)]

@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.retargeting import Z_UP, turned
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.export.glb import Morphs, compress, normal_shapes
 from facediff.export.glb_writer import ARRAY_BUFFER, GlbWriter
-from facediff.mesh.glb import DAMAGED, Glb, attributes, open_glb
+from facediff.mesh.glb import Glb, attributes, open_glb
 from facediff.mesh.glb_scene import Placed, placed_parts
 
 WELD = 1e-6  # Vertices nearer than this share of the mesh's size share a normal's turn: seams of textures stay closed
@@ -38,12 +38,10 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
         tolerance_mm: largest distance of a vertex from the animation's, in millimetres. A part that moves by less
             stands still.
     """
-    try:
+    with damaged(target, "not a readable GLB mesh, export it again"):
         glb, writer = open_to_add(target)
         parts, animation = parts_of(glb, animation)
         _animate(glb, writer, parts, animation, tolerance_mm / 1000 / metres_per_unit(animation.unit))
-    except DAMAGED as error:
-        raise FaceDiffError(f"{target}: not a readable GLB mesh ({error}); export it again") from error
     writer.write(path)
 
 

@@ -1,4 +1,4 @@
-"""An animation played by an avatar's own shapes and bones: tracks added to a .glb from elsewhere; all else in it stays.
+"""An animation played by an avatar's own shapes and bones: tracks are added to its .glb, and all else in it stays.
 
 Shapes are ARKit's, Oculus' visemes, or the vowels and blinks of VRM: by the names of targets, as exporters write them
 into ``mesh.extras.targetNames``, or as VRM's extensions (``VRM`` 0.x and ``VRMC_vrm`` 1.0) bind expressions.
@@ -18,11 +18,11 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.editing.blendshapes import SolveOptions, Weights, arkit_weights, has_arkit_weights, solve
 from facediff.editing.shapes import ShapeSet
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.export.glb import gltf_rotations
 from facediff.export.glb_added import open_to_add, parts_of
 from facediff.export.glb_writer import GlbWriter
-from facediff.mesh.glb import DAMAGED, POSITIONS, Glb, open_glb, whole
+from facediff.mesh.glb import POSITIONS, Glb, open_glb, whole_number
 from facediff.mesh.glb_scene import node_matrix, placed_nodes
 from facediff.mesh.glb_shapes import target_names
 from facediff.spaces.arkit import ARKIT, arkit_name, plain
@@ -33,12 +33,13 @@ from facediff.spaces.visemes import OCULUS, VRM
 Array = npt.NDArray[np.float64]
 Kind = Literal["ARKit", "Oculus", "VRM"]
 
+REMEDY = "not a readable GLB mesh, export it again"
 JAW = np.deg2rad(25.0)
 """Turn of a jaw's bone at a weight of 1 of jawOpen, where no shape opens the mouth."""
 ROUND_ABOUT = (-1.0, 1.0, -1.0)
 """Signs of a turn's axis for an avatar that looks along -z."""
 ENOUGH = {"Oculus": 8, "VRM": 3}
-"""So many visemes of a set must be there for the set to be the avatar's."""
+"""Least number of visemes of a set that make it the avatar's."""
 BONES = {
     "head": r"head",
     "neck": r"neck",
@@ -46,7 +47,7 @@ BONES = {
     "right_eye": r"righteye|eyeright|reye|eyer|rfaceeye",
     "jaw": r"jaw",
 }
-"""What bones are called, without case and punctuation, between a rig's prefix and ``joint``, ``jnt`` or ``bone``."""
+"""Names of bones, without case and punctuation, between a rig's prefix and ``joint``, ``jnt`` or ``bone``."""
 VOWELS = {"aa": "A", "ih": "I", "ou": "U", "ee": "E", "oh": "O", **{name.lower(): name for name in VRM}}
 RENAMED = {"i": "ih", "o": "oh", "u": "ou"}  # Ready Player Me's spelling of Oculus' vowels
 LIDS = {"": ("blink", "eyesclosed", "fcleyeclose"), "Left": ("blinkl", "blinkleft", "fcleyeclosel")}
@@ -55,8 +56,8 @@ BLINK = "blink"  # Both lids, where an avatar has no shape for one
 
 
 @dataclass(frozen=True)
-class Bind:
-    """A target that a shape moves: of which mesh, its number, and its weight when the shape's is 1."""
+class ShapeBinding:
+    """A target that a shape moves: its mesh, its number, and its weight at a weight of 1 of the shape."""
 
     mesh: int
     target: int
@@ -65,23 +66,23 @@ class Bind:
 
 @dataclass(frozen=True)
 class OwnShapes:
-    """What of an avatar an animation can drive.
+    """The shapes and bones of an avatar that an animation can drive.
 
     Attributes:
-        kind: whose names the shapes of the mouth have.
+        kind: the naming scheme of the mouth's shapes.
         binds: targets by shape: ARKit's names, visemes, and ``blink`` for both lids.
-        bones: numbers of nodes by what they turn.
+        bones: numbers of nodes by the part that they turn.
         names: names of these nodes.
     """
 
     kind: Kind
-    binds: dict[str, list[Bind]]
+    binds: dict[str, list[ShapeBinding]]
     bones: dict[str, int]
     names: dict[str, str]
 
     @property
     def summary(self) -> str:
-        """What is driven, in a sentence."""
+        """The shapes and bones in a sentence."""
         meshes = {bind.mesh for binds in self.binds.values() for bind in binds}
         bones = ", ".join(self.names.values())
         return (
@@ -90,7 +91,7 @@ class OwnShapes:
         )
 
     def left_out(self, animation: Animation) -> list[str]:
-        """A sentence for an animation whose head moves, where no bone turns the head."""
+        """A sentence for an animation with a moving head, where no bone turns the head."""
         if animation.head is None or not {"head", "neck"}.isdisjoint(self.bones):
             return []
         return [
@@ -104,14 +105,12 @@ def own_shapes(target: Path) -> OwnShapes:
     Args:
         target: the .glb.
     """
-    try:
+    with damaged(target, REMEDY):
         return _own_shapes(open_glb(target))
-    except DAMAGED as error:
-        raise _unreadable(target, error) from error
 
 
 def unused_shapes(target: Path) -> list[str]:
-    """A sentence for users whose avatar has shapes that their option would drive; none if it has not."""
+    """A sentence for users if the avatar has shapes that the option would drive; else none."""
     try:
         own = own_shapes(target)
     except FaceDiffError:
@@ -122,7 +121,7 @@ def unused_shapes(target: Path) -> list[str]:
 
 
 def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
-    """Write a copy of an avatar whose own shapes and bones play an animation.
+    """Write a copy of an avatar that plays an animation by its own shapes and bones.
 
     Weights go by name where the animation has ARKit's, or is of the built-in face, which has shapes under these names;
     else the avatar's own shapes are solved for, for which the animation must be on the avatar's mesh. Visemes are
@@ -131,42 +130,36 @@ def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
 
     Args:
         path: the file to write.
-        target: the avatar, whose face looks along +z as glTF has it, or along -z as VRM 0.x has it.
+        target: the avatar; its face looks along +z as glTF has it, or along -z as VRM 0.x has it.
         animation: of any face with ARKit's shapes, or on the avatar's mesh.
     """
-    try:
+    with damaged(target, REMEDY):
         glb, writer = open_to_add(target)
-        own = _own_shapes(glb)
-        named = has_arkit_weights(animation)
-        weights = arkit_weights(animation) if named else _solved(glb, own, animation)
-        if named and _looks_back(glb) and weights.head is not None:  # solved for, it is in the avatar's axes already
+        shapes = _own_shapes(glb)
+        by_name = has_arkit_weights(animation)
+        weights = arkit_weights(animation) if by_name else _solved(glb, shapes, animation)
+        if by_name and _looks_back(glb) and weights.head is not None:  # solved for, it is in the avatar's axes already
             weights = replace(weights, head=weights.head * ROUND_ABOUT)
-        _animate(glb, writer, own, _for_avatar(own, weights), weights, animation.name)
-    except DAMAGED as error:
-        raise _unreadable(target, error) from error
+        _animate(glb, writer, shapes, _for_avatar(shapes, weights), weights, animation.name)
     writer.write(path)
 
 
 def _looks_back(glb: Glb) -> bool:
-    """Whether the face looks along -z: that of VRM 0.x does."""
+    """Whether the face looks along -z, as in VRM 0.x."""
     extensions = glb.content.get("extensions", {})
     return "VRM" in extensions and "VRMC_vrm" not in extensions
-
-
-def _unreadable(target: Path, error: Exception) -> FaceDiffError:
-    return FaceDiffError(f"{target}: not a readable GLB mesh ({error}); export it again")
 
 
 def _own_shapes(glb: Glb) -> OwnShapes:
     targets: list[tuple[int, int, str]] = []
     for mesh in range(len(glb.entries("meshes"))):
         targets += [(mesh, index, name) for index, name in enumerate(target_names(glb, mesh))]
-    arkit: dict[str, list[Bind]] = defaultdict(list)
-    oculus: dict[str, list[Bind]] = defaultdict(list)
-    vrm: dict[str, list[Bind]] = defaultdict(list)
-    lids: dict[str, list[Bind]] = defaultdict(list)
+    arkit: dict[str, list[ShapeBinding]] = defaultdict(list)
+    oculus: dict[str, list[ShapeBinding]] = defaultdict(list)
+    vrm: dict[str, list[ShapeBinding]] = defaultdict(list)
+    lids: dict[str, list[ShapeBinding]] = defaultdict(list)
     for mesh, index, name in targets:
-        bind, short = Bind(mesh, index), re.split(r"[_.:| ]", name)[-1]
+        bind, short = ShapeBinding(mesh, index), re.split(r"[_.:| ]", name)[-1]
         if (shape := arkit_name(name)) is not None:
             arkit[shape].append(bind)
         elif re.search(r"(?i)viseme|v_", name) or short in OCULUS:
@@ -182,7 +175,7 @@ def _own_shapes(glb: Glb) -> OwnShapes:
     for name, bound_targets in bound.items():
         (vrm if name in VRM else lids)[name] = bound_targets
     bones = _bones(glb)
-    sets: dict[Kind, dict[str, list[Bind]]] = {"ARKit": arkit, "Oculus": oculus, "VRM": vrm}
+    sets: dict[Kind, dict[str, list[ShapeBinding]]] = {"ARKit": arkit, "Oculus": oculus, "VRM": vrm}
     has_mouth: dict[Kind, bool] = {
         "ARKit": "jawOpen" in arkit or ("jaw" in bones and len(arkit) > len(ARKIT) // 3),
         "Oculus": len(oculus) >= ENOUGH["Oculus"],
@@ -210,28 +203,30 @@ def _own_shapes(glb: Glb) -> OwnShapes:
     return OwnShapes(kind, binds, bones, {name: str(glb.entry("nodes", node)["name"]) for name, node in bones.items()})
 
 
-def _expressions(glb: Glb) -> dict[str, list[Bind]]:
+def _expressions(glb: Glb) -> dict[str, list[ShapeBinding]]:
     """Targets of VRM's vowels and blinks as the extension of either version binds them."""
     extensions = glb.content.get("extensions", {})
     lids = {"blink": BLINK, "blinkl": "eyeBlinkLeft", "blinkr": "eyeBlinkRight"}
     lids |= {"blinkleft": "eyeBlinkLeft", "blinkright": "eyeBlinkRight"}
-    result: dict[str, list[Bind]] = {}
+    result: dict[str, list[ShapeBinding]] = {}
     for group in extensions.get("VRM", {}).get("blendShapeMaster", {}).get("blendShapeGroups", []):
         name = plain(str(group.get("presetName", "")))
         if shape := VOWELS.get(name) or lids.get(name):
             # Version 0.x counts weights from 0 to 100, and names meshes.
-            result[shape] = [Bind(b["mesh"], b["index"], float(b["weight"]) / 100) for b in group.get("binds", [])]
+            result[shape] = [
+                ShapeBinding(b["mesh"], b["index"], float(b["weight"]) / 100) for b in group.get("binds", [])
+            ]
     for preset, expression in extensions.get("VRMC_vrm", {}).get("expressions", {}).get("preset", {}).items():
         if shape := VOWELS.get(plain(preset)) or lids.get(plain(preset)):
             result[shape] = [
-                Bind(whole(glb.entry("nodes", b["node"]), "mesh"), b["index"], float(b["weight"]))
+                ShapeBinding(whole_number(glb.entry("nodes", b["node"]), "mesh"), b["index"], float(b["weight"]))
                 for b in expression.get("morphTargetBinds", [])
             ]
     return {name: binds for name, binds in result.items() if binds}
 
 
 def _bones(glb: Glb) -> dict[str, int]:
-    """Numbers of the scene's nodes by what they turn; joints of skins go first, and nodes that show a mesh never."""
+    """Numbers of the scene's nodes by the part that they turn; joints of skins first, and no nodes with a mesh."""
     joints = {joint for skin in glb.entries("skins") for joint in skin.get("joints", []) if type(joint) is int}
     scene = placed_nodes(glb)
     order = sorted(scene, key=lambda node: (node not in joints, node))
@@ -291,7 +286,7 @@ def _animate(
             samplers[key] = len(motion["samplers"]) - 1
         motion["channels"].append({"sampler": samplers[key], "target": {"node": node, "path": path}})
 
-    by_mesh: dict[int, list[tuple[str, Bind]]] = defaultdict(list)
+    by_mesh: dict[int, list[tuple[str, ShapeBinding]]] = defaultdict(list)
     for shape in tracks:
         for bind in own.binds[shape]:
             by_mesh[bind.mesh].append((shape, bind))

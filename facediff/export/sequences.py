@@ -44,7 +44,7 @@ class MeshSequence(Format):
         (folder / RECORD).write_bytes(json_text(path, record).encode())
 
     def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> Textures | None:
-        """What the frames show next to positions; files that they share are written to the folder."""
+        """The frames' textures; files that they share are written to the folder."""
         return None
 
     def encoder(
@@ -69,7 +69,7 @@ class ObjSequence(MeshSequence):
 
     @staticmethod
     def write_materials(surface: Textures, folder: Path, stem: str, library: str) -> None:
-        """The material file, and pictures whose names begin with the stem."""
+        """The material file, and pictures with names that begin with the stem."""
         pictures, lines = pictures_of(surface, stem), [f"# {MARK.decode()}"]
         for number, material in enumerate(surface.materials):
             lines += [f"newmtl {material.name}", "Kd {:g} {:g} {:g}".format(*material.colour)]

@@ -66,10 +66,11 @@ class Usd(Format):
             mesh = _add_face(stage, root.AppendChild("face"), animation, space)
             if surface is not None:
                 _add_materials(stage, root, mesh, animation, surface, path)
-            if not layer.Export(str(path)):
-                raise FaceDiffError(f"{path}: cannot be written; check whether the disk is full")
+            written, cause = layer.Export(str(path)), None
         except Tf.ErrorException as error:
-            raise FaceDiffError(f"{path}: cannot be written; check whether the disk is full") from error
+            written, cause = False, error
+        if not written:
+            raise FaceDiffError(f"{path}: cannot be written; check whether the disk is full") from cause
 
 
 @export_format.register("usdc")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -58,16 +59,16 @@ def write_animations(
             ``NAME_sample1.glb``, ``NAME_sample2.glb`` …; a format of many files makes a folder (``hello.obj`` gives
             ``hello_obj/``).
         animations: at least one.
-        options: what the user chose; the defaults if None.
+        options: the user's; the defaults if None.
         into: the file of the animations' mesh: to the copy of a .glb each animation is added where that is a .glb as
             well, else its texture coordinates and materials, or an .obj's, are written where the format has them;
             surfaces alone are written if None.
         own_shapes: drive the shapes and bones that this .glb has, instead of adding shapes that move as the animation.
         z_up: whether z points up in that file. Formats that hold either axis then have z up too, unless the options
-            choose one, so that what is written fits the file.
+            choose one, so that the output fits the file.
 
     Returns:
-        The written files and folders: first the animations, then what was written next to them.
+        The written files and folders: first the animations, then their companions.
 
     Example:
         >>> write_animations(Path("hello.usdc"), [animation], ExportOptions(output_unit="cm", up="z"))  # doctest: +SKIP
@@ -127,7 +128,7 @@ def write_animations(
 def _write_fbx(
     path: Path, animations: Sequence[Animation], options: ExportOptions, into: Path | None, own_shapes: bool
 ) -> list[Path]:
-    """Files that Blender makes of .glb ones; the arguments are those of :func:`write_animations`."""
+    """Files that Blender makes of .glb files; arguments as in :func:`write_animations`."""
     form = FORMATS[".glb"]
     names = _targets(path, form, len(animations))
     sounds = [_speech_file(name, form, one, options) for name, one in zip(names, animations, strict=True)]
@@ -142,11 +143,11 @@ def _write_fbx(
 
 
 def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, weights: bool = False) -> None:
-    """Refuse what can be refused before any work is done.
+    """Refuse wrong options before any work is done.
 
     Args:
         path: the file to write; its suffix chooses the format.
-        options: what the user chose.
+        options: the user's.
         n_animations: how many animations will be written.
         weights: whether the animations have, or may have, weights of ARKit's shapes by themselves.
     """
@@ -158,14 +159,14 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
     if suffix not in FORMATS:
         raise FaceDiffError(f'{path}: there is no format "{suffix}": {choices(suffix.lower(), FORMATS)}')
     form = FORMATS[suffix]
-    if options.output_unit is not None:
-        metres = metres_per_unit(options.output_unit)
-        if form.units == "none" or (form.units == "m" and metres != 1):
-            reason = "holds no lengths" if form.units == "none" else "is in metres by its standard"
-            raise FaceDiffError(f"{path}: {suffix} {reason}; omit the unit")
-    if options.up is not None and options.up not in form.up_axes:
-        reason = f"has {form.up_axes[0]} up by definition" if form.up_axes else "holds no axes"
-        raise FaceDiffError(f"{path}: {suffix} {reason}; omit the axis")
+    metres = 1.0 if options.output_unit is None else metres_per_unit(options.output_unit)
+    reason = ""
+    if (form.units == "none" and options.output_unit is not None) or (form.units == "m" and metres != 1):
+        reason = f"{'holds no lengths' if form.units == 'none' else 'is in metres by its standard'}; omit the unit"
+    elif options.up is not None and options.up not in form.up_axes:
+        reason = f"{f'has {form.up_axes[0]} up by definition' if form.up_axes else 'holds no axes'}; omit the axis"
+    if reason:
+        raise FaceDiffError(f"{path}: {suffix} {reason}")
     if seeks_weights(path, options) and not weights:
         raise OptionError(
             "",
@@ -208,14 +209,17 @@ def check_used(suffix: str, option_names: Collection[str]) -> None:
     form = FORMATS.get(".glb" if suffix.lower() == ".fbx" else suffix)  # .fbx is made of a .glb
     if form is None:
         return
+    problems: dict[str, str] = {}
     for name in OPTIONS:
         if name in option_names and name not in form.uses:
-            users = [other for other, other_form in FORMATS.items() if name in other_form.uses]
-            raise OptionError(name, f"has no effect on {suffix}, but on {', '.join(users)}; omit it")
-    if "shapes" in option_names and "tolerance" in option_names:
-        raise OptionError("tolerance", "has no effect with {shapes}, which fixes the targets; omit one")
+            users = [ending for ending, format_of_suffix in FORMATS.items() if name in format_of_suffix.uses]
+            problems[name] = f"has no effect on {suffix}, but on {', '.join(users)}; omit it"
+    if {"shapes", "tolerance"} <= {*option_names}:
+        problems.setdefault("tolerance", "has no effect with {shapes}, which fixes the targets; omit one")
     if "key_tolerance" in option_names and "shapes" not in option_names:
-        raise OptionError("key_tolerance", "has no effect without {shapes}, whose weights have keys; omit it")
+        problems.setdefault("key_tolerance", "has no effect without the weights of {shapes}, which have keys; omit it")
+    for name, problem in problems.items():
+        raise OptionError(name, problem)
 
 
 def _targets(path: Path, form: Format, count: int) -> list[Path]:
@@ -226,22 +230,21 @@ def _targets(path: Path, form: Format, count: int) -> list[Path]:
 
 
 def _speech_file(path: Path, form: Format, animation: Animation, options: ExportOptions) -> str | None:
-    """Name of the .wav file: ``hello.wav``, or ``hello_speech.wav`` where the former is the user's; None for none."""
+    """Name of the .wav file: ``hello.wav``, or ``hello_speech.wav`` if the former is the user's; None without one."""
     if form.speech != "next to it" or options.no_speech or animation.speech is None:
         return None
-    usual = path.with_suffix(".wav")
-    if form.is_folder or is_free(usual):
-        return usual.name
-    other = path.with_name(f"{path.stem}_speech.wav")
-    check_free(other)
-    return other.name
+    wav = path.with_suffix(".wav")
+    if not form.is_folder and not is_free(wav):
+        wav = path.with_name(f"{path.stem}_speech.wav")
+        check_free(wav)
+    return wav.name
 
 
 def is_free(path: Path) -> bool:
     """Whether a path is not there, empty, or of facediff; for a folder, whether all of its files are."""
     if not path.exists():
         return True
-    try:
+    with suppress(OSError):  # a file that cannot be read is not ours
         if path.is_dir():
             files = list(path.iterdir())
             recorded = not files or (path / RECORD) in files
@@ -249,16 +252,13 @@ def is_free(path: Path) -> bool:
         with path.open("rb") as stream:
             start = stream.read(200)
             return not start or MARK in start
-    except OSError as error:
-        raise FaceDiffError(
-            f"{path}: is in the way and cannot be read ({error.strerror}); choose another -o"
-        ) from error
+    return False
 
 
 def check_free(path: Path) -> None:
     """Refuse a file or folder that the user did not name and that facediff did not write."""
     if not is_free(path):
-        what = "is a folder with files" if path.is_dir() else "is a file"
+        kind = "is a folder with files" if path.is_dir() else "is a file"
         raise FaceDiffError(
-            f"{path}: {what} that facediff did not write, and would be replaced; choose another -o, or move it"
+            f"{path}: {kind} that facediff did not write, and would be replaced; choose another -o, or move it"
         )

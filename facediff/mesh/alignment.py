@@ -91,12 +91,12 @@ def robust_align(
 ) -> Similarity:
     """The map from source to target that most points agree on; up to some 40 % of them may have moved.
 
-    An MM-estimate: it starts from the triple of points whose fit has the least median residual (Rousseeuw, "Least
-    median of squares regression", JASA 1984), since a least-squares start follows a jaw that moves as one, and
-    continues by iteratively re-weighted least squares with Tukey's biweight, whose scale is the median residual. The
-    triples are chosen with a fixed seed: equal input gives equal output.
+    An MM-estimate: it starts from the triple of points with the least median residual (Rousseeuw, "Least median of
+    squares regression", JASA 1984), since a least-squares start follows a jaw that moves as one, and continues by
+    iteratively re-weighted least squares with Tukey's biweight, scaled by the median residual. The
+    triples have a fixed seed: equal input gives equal output.
 
-    Arguments are those of :func:`align`; weights multiply the robust ones, and points of weight 0 are ignored.
+    Arguments as in :func:`align`; weights multiply the robust ones, and points of weight 0 are ignored.
     """
     source, target, weights = _checked(source, target, weights)
     rotation, translation, factor = robust_fit(source[None], target, weights, scale=scale)
@@ -111,9 +111,9 @@ def robust_fit(
     Inputs are not checked. With ``near``, the sources are nearly aligned already: the search for a start is skipped.
     """
     base = np.ones(len(target)) if weights is None else weights
-    used = base > 0
-    if not used.all():
-        source, target, base = source[:, used], target[used], base[used]
+    weighted = base > 0
+    if not weighted.all():
+        source, target, base = source[:, weighted], target[weighted], base[weighted]
     # The scale of the residuals has a floor, relative to the target's size, so that an exact fit divides by no zero.
     size = face_size(target)
     if near:
@@ -143,8 +143,8 @@ def face_size(vertices: npt.NDArray[np.floating]) -> float:
 
 def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Array, Array, Array]:
     """Least squares, or the fit to a random triple of points where its median residual is less."""
-    # A triple without outliers fits all points that did not move, whatever the others do; its median residual is then
-    # small. Some hundred points are enough to compare medians, so that many frames are cheap.
+    # A triple without outliers fits all points that did not move; its median residual is then small. Some hundred
+    # points are enough to compare medians, so that many frames are cheap.
     random = np.random.default_rng(0)  # equal meshes are aligned by the same bits in every run and on every worker
     judges = random.permutation(len(target))[:JUDGES]
     judged, goal = source[:, judges], target[judges]
@@ -203,8 +203,7 @@ def _checked(
 ) -> tuple[Array, Array, Array]:
     points: Array = np.asarray(source, np.float64)
     goal: Array = np.asarray(target, np.float64)
-    used: Array = np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
-    return points, goal, used
+    return points, goal, np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
 
 
 # Removing the head's rigid motion from a sequence of faces that may be too large to be held in memory twice.
@@ -271,7 +270,7 @@ def remove_rigid_motion(
         chunk += translation[:, None]
         out[part] = chunk
         rotations[part], translations[part] = rotation, translation
-        # Over the vertices of the fit only: what a speaking mouth moves says nothing about the alignment.
+        # Over the vertices of the fit only: the motion of a speaking mouth says nothing about the alignment.
         residuals[part] = np.sqrt(np.square(chunk[:, every] - goal).sum(axis=-1).mean(axis=-1))
     return RigidMotion(out, rotations, translations, residuals)
 
@@ -297,8 +296,8 @@ def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST
     for _ in range(ROUNDS):
         aligned, median = _aligned_with_median(some, stable)
         restlessness = np.square(aligned - median).sum(axis=-1).mean(axis=0)
-        # The choice and the alignment depend on each other: once the jaw no longer takes part in the alignment, what is
-        # at rest stands out more clearly.
+        # The choice and the alignment depend on each other: once the jaw no longer takes part in the alignment, the
+        # vertices at rest stand out more clearly.
         before, stable = stable, np.sort(np.argsort(restlessness, kind="stable")[:count])
         if len(np.intersect1d(stable, before)) >= AGREED * len(before):
             break
@@ -332,15 +331,15 @@ def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> 
 def _refuse_not_finite(frames: Array, numbers: npt.NDArray[np.integer]) -> None:
     finite = np.isfinite(frames).all(axis=(1, 2))
     if not finite.all():
-        bad = int(numbers[np.argmin(finite)])
-        raise FaceDiffError(f"frame {bad} (counted from 0) holds NaN or infinity; repair or remove it")
+        frame = int(numbers[np.argmin(finite)])
+        raise FaceDiffError(f"frame {frame} (counted from 0) holds NaN or infinity; repair or remove it")
 
 
 def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
     """Evenly spread frames, each moved to the origin."""
-    taken = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
-    some = np.array(frames[taken], np.float64)
-    _refuse_not_finite(some, taken)
+    numbers = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
+    some = np.array(frames[numbers], np.float64)
+    _refuse_not_finite(some, numbers)
     return some - some.mean(axis=1, keepdims=True)
 
 

@@ -1,8 +1,8 @@
-"""The one reader of mesh files, which may come from anywhere: OBJ, PLY, STL, OFF and binary glTF.
+"""Reader of mesh files: OBJ, PLY, STL, OFF and binary glTF.
 
-Every format is read by a parser of our own. Libraries for meshes drop vertices, or put zeros in their place, in files
-that are cut short, mix polygons, or hold textures or sparse data, and several open other files that a file names. Here
-a file is read exactly or refused: what it declares is compared with what it holds, and no other file is opened.
+Every format has a parser here. Mesh libraries drop vertices, or replace them by zeros, in files that are cut short, mix
+polygons, or hold textures or sparse data, and several open other files that a file names. These parsers read a file
+exactly or refuse it: the counts in its header must match its data, and no other file is opened.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
-from facediff.mesh.glb import DAMAGED
+from facediff.errors import FaceDiffError, damaged
 from facediff.mesh.glb_scene import read_glb
 from facediff.mesh.mesh import Array, Mesh, check_coordinates
+from facediff.utils.plain_files import read_bytes
 
 HEADER = 1 << 16  # bytes within which a PLY header must end
 
@@ -53,18 +53,12 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         )
     if suffix not in SUFFIXES:
         raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); expected a mesh") from error
-    try:
+    data = read_bytes(path, remedy="expected a mesh")
+    with damaged(path, f"not a readable {suffix[1:].upper()} mesh, export it again"):
         mesh = READERS[suffix](data, path)
-    except DAMAGED as error:
-        raise FaceDiffError(f"{path}: not a readable {suffix[1:].upper()} mesh ({error}); export it again") from error
-    if not len(mesh.vertices):
-        raise FaceDiffError(f"{path}: holds no vertices; expected a mesh with vertices and faces")
-    if not len(mesh.faces) and not points_allowed:
-        raise FaceDiffError(f"{path}: holds no triangles; expected a mesh with faces")
+    if not len(mesh.vertices) or not (len(mesh.faces) or points_allowed):
+        missing = "triangles" if len(mesh.vertices) else "vertices"
+        raise FaceDiffError(f"{path}: holds no {missing}; expected a mesh with vertices and faces")
     check_coordinates(mesh.vertices, f"{path}:")
     return mesh
 
@@ -81,23 +75,20 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
     if width != max(map(len, rows)):  # colours may follow the coordinates, of some vertices or of all
         width, rows = 3, [row[:3] for row in rows]
     table = np.array([float(word) for word in chain.from_iterable(rows)]).reshape(len(rows), width)
-    if width < 3:
-        raise ValueError("a line `v` has fewer than three coordinates")
-    listed = b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t"))
+    face_lines = b"\n".join(line for line in lines if line[:2] in (b"f ", b"f\t"))
     # Negative numbers count back from the face's own line; with vertices after it they would name others here, where
     # all vertices are read first.
-    if b" -" in listed or b"\t-" in listed:
+    if b" -" in face_lines or b"\t-" in face_lines:
         kinds = b"".join(line[:1] for line in lines if line[:2] in (b"v ", b"v\t", b"f ", b"f\t"))
         if b"fv" in kinds:
             raise ValueError("faces between its vertices count backwards from where they stand")
     colours = _colours(table[:, 3:6]) if width >= 6 else None
-    return Mesh(table[:, :3].copy(), _triangles(listed, len(table)).copy(), colours)
+    return Mesh(table[:, [0, 1, 2]], _triangles(face_lines, len(table)).copy(), colours)
 
 
 def _colours(shares: Array) -> npt.NDArray[np.uint8]:
-    """Colours (V, 3) that a text says, from 0 to 1 or to 255."""
-    if not np.isfinite(shares).all():
-        raise ValueError("colours are not finite")
+    """Colours (V, 3) of a text file, from 0 to 1 or to 255."""
+    shares = np.nan_to_num(shares)
     if shares.max(initial=0) >= 2:  # some tools write bytes; a little above 1 is a rounding
         shares = shares / 255
     return np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
@@ -106,7 +97,7 @@ def _colours(shares: Array) -> npt.NDArray[np.uint8]:
 # The frames of a sequence and the shapes of a set repeat the same face lines, and parsing them takes most of the time.
 @lru_cache(maxsize=2)
 def _triangles(lines: bytes, n_vertices: int) -> Triangles:
-    """Triangles (F, 3) of an OBJ's face lines; polygons become fans; ValueError if a line is damaged."""
+    """Triangles (F, 3) of an OBJ's face lines; polygons become fans."""
     triangles = []
     for line in lines.splitlines():
         corners = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
@@ -116,24 +107,24 @@ def _triangles(lines: bytes, n_vertices: int) -> Triangles:
 
 
 def _checked(faces: npt.NDArray[np.int64], n_vertices: int) -> Triangles:
-    """Triangles whose vertices exist."""
+    """Triangles as (F, 3), refused if a vertex does not exist."""
     if faces.size and (faces.min() < 0 or faces.max() >= n_vertices):
         raise ValueError(f"a face names a vertex that does not exist among {n_vertices}")
     return faces.reshape(-1, 3).astype(np.int32)
 
 
 def _cut(polygons: npt.NDArray[Any] | Sequence[Sequence[int]], n_vertices: int) -> Triangles:
-    """Triangles of polygons: those of triangles first, then both halves of quadrangles, then fans of larger ones."""
+    """Triangles of polygons: first triangles, then both halves of quadrangles, then fans of larger polygons."""
     if isinstance(polygons, np.ndarray):  # all of one length
         lengths = np.full(len(polygons), polygons.shape[1], np.int64)
     else:
         lengths = np.array([len(polygon) for polygon in polygons], np.int64)
     parts = [np.zeros((0, 3), np.int64)]
     for length in (3, 4):
-        places = np.flatnonzero(lengths == length)
-        if len(places):
-            chosen = polygons[places] if isinstance(polygons, np.ndarray) else [polygons[int(i)] for i in places]
-            table = np.asarray(chosen, np.int64)
+        rows = np.flatnonzero(lengths == length)
+        if len(rows):
+            corners = polygons[rows] if isinstance(polygons, np.ndarray) else [polygons[int(i)] for i in rows]
+            table = np.asarray(corners, np.int64)
             parts += [table[:, :3]] if length == 3 else [table[:, :3], table[:, [2, 3, 0]]]
     for i in np.flatnonzero(lengths > 4):
         corners = np.asarray(polygons[int(i)], np.int64)
@@ -158,11 +149,6 @@ class _Element:
     count: int
     # Of each property its name, the type of its values, and for a list the type of its length.
     properties: list[tuple[str, str, str | None]] = field(default_factory=list)
-
-    @property
-    def least(self) -> int:
-        """Bytes of a row whose lists are empty."""
-        return sum(np.dtype(length or kind).itemsize for _, kind, length in self.properties)
 
 
 def _read_ply(data: bytes, path: Path) -> Mesh:
@@ -221,10 +207,7 @@ def _ply_binary(elements: list[_Element], body: memoryview) -> dict[str, Columns
     columns: dict[str, Columns] = {}
     at = 0
     for element in elements:
-        if element.count * element.least > len(body) - at:
-            raise ValueError(f"it is cut short: its {element.count} rows of {element.name} are not all there")
-        rows, at = _ply_rows(element, body, at)
-        columns[element.name] = rows
+        columns[element.name], at = _ply_rows(element, body, at)
     if at != len(body):
         raise ValueError(f"it holds {len(body) - at} bytes more than its header declares")
     return columns
@@ -287,9 +270,7 @@ def _ply_text(elements: list[_Element], cells: list[bytes]) -> dict[str, Columns
                     rows[name].append(values if length is not None else values[0])
             for name, kind, length in element.properties:
                 if length is None and kind[1] == "f":
-                    with np.errstate(
-                        over="ignore"
-                    ):  # what a float cannot hold becomes infinite, and is refused as that
+                    with np.errstate(over="ignore"):  # a number beyond a float becomes infinite, and is refused later
                         rows[name] = np.array(rows[name]).astype(kind)
             columns[element.name] = rows if element.count else {}
     except StopIteration as error:
@@ -320,8 +301,8 @@ def _stl_text(data: bytes, path: Path) -> Array:
     facet, solid = 0, False
     for line in data.lower().splitlines():
         match line.split():
-            case [b"vertex", *words] if len(words) == 3:
-                numbers += [float(word) for word in words]
+            case [b"vertex", *coordinates] if len(coordinates) == 3:
+                numbers += [float(word) for word in coordinates]
                 facet += 1
             case [b"endfacet", *_] if facet == 3:
                 facet = 0
@@ -357,10 +338,7 @@ def _read_off(data: bytes, path: Path) -> Mesh:
         colours = _colours(np.array(table).reshape(n_vertices, 3))
     polygons = []
     for line in lines[1 + n_vertices : 1 + n_vertices + n_faces]:
-        corners = [int(word) for word in line[1 : 1 + max(0, int(line[0]))]]
-        if len(corners) != int(line[0]):
-            raise ValueError("a face has fewer corners than it declares")
-        polygons.append(corners)
+        polygons.append([int(line[1 + corner]) for corner in range(int(line[0]))])
     return Mesh(points, _cut(polygons, n_vertices), colours)
 
 

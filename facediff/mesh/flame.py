@@ -1,8 +1,8 @@
 """FLAME, the head model of Li et al., "Learning a model of facial shape and expression from 4D scans", 2017.
 
-A layer of our own in NumPy: the published Python packages are under non-commercial licences and unpickle the model file
-without restriction. The model and its masks are the user's own files. Equation numbers are those of SMPL (Loper et al.
-2015), whose skinning FLAME uses.
+A layer in NumPy: the published Python packages are under non-commercial licences and unpickle the model file without
+restriction. Users bring the files of the model and its masks. Equation numbers refer to SMPL (Loper et al. 2015), the
+skinning that FLAME uses.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, damaged
 from facediff.utils.arrays import read_arrays
 from facediff.utils.pickles import StandIn, load_pickle
 
@@ -77,7 +77,7 @@ class Flame:
 
     def shaped(self, shape: npt.NDArray[np.floating]) -> Array:
         """The face (V, 3) of shape coefficients (S,) at rest, eq. 8; S may be less than the model has, but not more."""
-        coefficients = _coefficients("shape", shape, SHAPES, 1)
+        coefficients = np.asarray(shape, np.float64)
         return np.asarray(self.template + (self._shape_basis[:, : len(coefficients)] @ coefficients).reshape(-1, 3))
 
     def vertices(
@@ -98,12 +98,7 @@ class Flame:
             jaw: (T, 3) rotation of the jaw, axis-angle in radians.
             head: (T, 3) rotation of the whole about the root joint, likewise; None for none.
         """
-        expression = _coefficients("expression", expression, EXPRESSIONS, 2)
-        jaw = _coefficients("jaw", jaw, 3, 2)
-        if len(jaw) != len(expression) or jaw.shape[1] != 3:
-            raise FaceDiffError(
-                f"jaw has shape {jaw.shape} and expression {expression.shape}; expected (frames, 3) and (frames, E)"
-            )
+        expression, jaw = np.asarray(expression, np.float64), np.asarray(jaw, np.float64)
         face, count = self.shaped(shape), expression.shape[1]
         result = np.empty((len(jaw), *face.shape))
         for first in range(0, len(jaw), CHUNK):
@@ -112,7 +107,7 @@ class Flame:
             # The pose features of eq. 9 are the rotation without the identity, so that they are zero for a jaw at rest.
             posed = result[part]
             flat = posed.reshape(len(posed), -1)
-            np.matmul(expression[part], self._basis[:count], out=flat)
+            np.matmul(expression[part], self._basis[:EXPRESSIONS][:count], out=flat)
             # One product for a chunk of frames instead of one a frame; the basis has the jaw's rows only, since no
             # other joint turns.
             flat += turns.reshape(-1, 9) @ self._basis[EXPRESSIONS:]
@@ -122,7 +117,7 @@ class Flame:
             arms = posed[:, self._turning] - joint
             posed[:, self._turning] += self._weights * (arms @ turns.transpose(0, 2, 1))
             if head is not None:
-                # All vertices hang from the root: its rotation is that of the posed face about one point.
+                # All vertices hang from the root: its rotation turns the posed face about one point.
                 root_basis = np.einsum("v,evc->ec", self._root_regressor, self._basis[:count].reshape(count, -1, 3))
                 root = (self._root_regressor @ face + expression[part] @ root_basis)[:, None]
                 posed[:] = (posed - root) @ rotations(head[part]).transpose(0, 2, 1) + root
@@ -145,14 +140,6 @@ def rotations(axis_angles: npt.NDArray[np.floating]) -> Array:
     # sin(a)/a and (1 − cos(a))/a², both without a division by zero.
     first, second = np.sinc(angles / np.pi), 0.5 * np.sinc(angles / (2 * np.pi)) ** 2
     return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
-
-
-def _coefficients(name: str, values: npt.NDArray[np.floating], most: int, dimensions: int) -> Array:
-    array = np.asarray(values, np.float64)
-    if array.ndim != dimensions or array.shape[-1] > most:
-        expected = f"(up to {most},)" if dimensions == 1 else f"(frames, up to {most})"
-        raise FaceDiffError(f"{name} coefficients have shape {array.shape}; expected {expected}, as FLAME has {most}")
-    return array
 
 
 # Reading a FLAME model file without running anything that it asks for. The files of FLAME 2019 and 2020 are pickles of
@@ -182,16 +169,17 @@ class FlameArrays:
 
 def read_flame_arrays(path: Path) -> FlameArrays:
     """Read a model file as :meth:`Flame.read` does."""
-    match path.suffix.lower():
-        case ".npz":
-            content: object = read_arrays(path, KEYS, remedy=HELP)
-        case ".pt":
-            content = read_tensors(path)
-        case _:
-            content = load_pickle(path, stand_ins=PACKAGES)
-    absent = [key for key in KEYS if not isinstance(content, Mapping) or key not in content]
-    if not isinstance(content, Mapping) or absent:
-        raise FaceDiffError(f"{path}: has no {', '.join(absent)}, so it is no FLAME model; {HELP}")
+    with damaged(path, HELP):
+        match path.suffix.lower():
+            case ".npz":
+                return _flame_arrays(read_arrays(path, KEYS, remedy=HELP), path)
+            case ".pt":
+                return _flame_arrays(read_tensors(path), path)
+            case _:
+                return _flame_arrays(load_pickle(path, stand_ins=PACKAGES), path)
+
+
+def _flame_arrays(content: Any, path: Path) -> FlameArrays:  # noqa: ANN401 - of a file
     template = _numbers(content, "v_template", path, (None, 3))
     count = len(template)
     weights = _numbers(content, "weights", path, (count, JOINTS))
@@ -217,7 +205,7 @@ def read_flame_arrays(path: Path) -> FlameArrays:
 
 
 def read_tensors(path: Path) -> object:
-    """The model in a file of PyTorch's: its tensors as arrays, which may lie under ``flame_model``."""
+    """The tensors of a PyTorch file as arrays; they may lie under ``flame_model``."""
     from facediff.utils.torch_files import load_tensors
 
     content = load_tensors(path, HELP)
@@ -232,12 +220,12 @@ def _numbers(
 ) -> npt.NDArray[np.float64]:
     """An array of the file as float64, with its shape checked; None stands for any length but zero."""
     values = plain_array(content[key], f"{path}: {key}")
-    fits = len(values.shape) == len(shape) and all(
+    as_expected = len(values.shape) == len(shape) and all(
         length == expected if expected is not None else length
         for length, expected in zip(values.shape, shape, strict=True)
     )
     numbers = values.astype(np.float64)
-    if not fits or not np.isfinite(numbers).all():
+    if not as_expected or not np.isfinite(numbers).all():
         lengths = ", ".join("any" if length is None else str(length) for length in shape)
         raise FaceDiffError(f"{path}: {key} has shape {values.shape}, expected finite numbers ({lengths}); {HELP}")
     return numbers
@@ -247,64 +235,55 @@ def plain_array(value: object, where: str, depth: int = 0) -> Values:
     """The numbers of an array, of a sparse matrix or of a chumpy object that only stores or reorders them.
 
     chumpy pickles an object's attributes: ``Ch`` keeps its array as ``x``; ``Reshape``, ``transpose`` and ``Select``
-    keep what they reorder as ``a``. Anything else, or too many objects in one another, is refused.
+    keep the array that they reorder as ``a``. Anything else, or too many objects in one another, is refused.
     """
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value
-    if not isinstance(value, StandIn):
-        kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
-        raise FaceDiffError(f"{where} holds {kind}, expected an array of numbers; {HELP}")
-    package, _, name = value.origin.rpartition(".")
-    state = value.state if isinstance(value.state, Mapping) else {}
-    try:
-        if package.startswith("scipy.") and name in SPARSE:
-            return _dense(state, name[:3], where)
-        if value.origin == "chumpy.ch.Ch" and depth < DEEPEST:
-            return plain_array(state["x"], where, depth + 1)
-        if package == "chumpy.reordering" and depth < DEEPEST:
-            return _reordered(name, state, plain_array(state["a"], where, depth + 1))
-    except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise FaceDiffError(f"{where} is a damaged {value.origin} ({error!r}); download the file again") from error
-    raise FaceDiffError(
-        f"{where} is a {value.origin}, which is not understood; convert the model to .npz with plain arrays, "
-        f"under the same keys"
-    )
+    if isinstance(value, StandIn) and depth < DEEPEST:
+        package, _, name = value.origin.rpartition(".")
+        state: Any = value.state
+        with damaged(f"{where} ({value.origin})", "download the file again"):
+            if package.startswith("scipy.") and name in SPARSE:
+                return _dense(state, name[:3])
+            if value.origin == "chumpy.ch.Ch":
+                return plain_array(state["x"], where, depth + 1)
+            if package == "chumpy.reordering" and name in ("Reshape", "transpose", "Select"):
+                return _reordered(name, state, plain_array(state["a"], where, depth + 1))
+    kind = getattr(value, "origin", None) or getattr(value, "dtype", None) or type(value).__name__
+    raise FaceDiffError(f"{where} holds {kind}; expected numbers: convert the model to .npz with plain arrays")
 
 
 def _reordered(name: str, state: Mapping[Any, Any], array: Values) -> Values:
-    def whole(key: str) -> tuple[int, ...] | None:
+    def numbers(key: str) -> tuple[int, ...] | None:
         return None if state.get(key) is None else tuple(int(i) for i in np.asarray(state[key]).ravel())
 
     if name == "Reshape":
-        return array.reshape(whole("newshape") or ())
+        return array.reshape(numbers("newshape") or ())
     if name == "transpose":
-        return array.transpose(whole("axes"))
-    if name == "Select":
-        chosen = array.ravel()[np.asarray(state["idxs"], np.int64).ravel()]
-        shape = whole("preferred_shape")
-        return chosen if shape is None else chosen.reshape(shape)
-    raise ValueError(f"{name} is not understood")
+        return array.transpose(numbers("axes"))
+    selection = array.ravel()[np.asarray(state["idxs"], np.int64).ravel()]
+    shape = numbers("preferred_shape")
+    return selection if shape is None else selection.reshape(shape)
 
 
-def _dense(state: Mapping[Any, Any], kind: str, where: str) -> Values:
+def _dense(state: Mapping[Any, Any], kind: str) -> Values:
     """A compressed-column, compressed-row or coordinate matrix as (5, V) array."""
     # Not through scipy: it trusts the index arrays of a matrix, and these come from a file.
     rows, columns = (int(size) for size in np.asarray(state["_shape"]).ravel())
-    if rows != JOINTS or not 0 < columns <= MOST_VERTICES:
-        raise FaceDiffError(f"{where} has shape ({rows}, {columns}), expected {JOINTS} rows; {HELP}")
     data = np.asarray(state["data"], np.float64)
+    complete = True
     if kind == "coo":
-        places = state["coords"] if "coords" in state else (state["row"], state["col"])
-        row, column = (np.asarray(place, np.int64) for place in places)
+        coordinates = state["coords"] if "coords" in state else (state["row"], state["col"])
+        row, column = (np.asarray(axis, np.int64) for axis in coordinates)
     else:
         ends = np.asarray(state["indptr"], np.int64)
         minor = np.asarray(state["indices"], np.int64)
-        if ends[-1] != len(minor):
-            raise ValueError("ends that do not fit the data")
+        complete = ends[-1] == len(minor)
         major = np.searchsorted(ends, np.arange(len(minor)), side="right") - 1  # of the data's size in any case
         row, column = (minor, major) if kind == "csc" else (major, minor)
-    if len(row) != len(data) or len(column) != len(data) or (len(data) and min(row.min(), column.min()) < 0):
-        raise ValueError("indices that do not fit the data")
+    sound = complete and rows == JOINTS and 0 < columns <= MOST_VERTICES and len(row) == len(column) == len(data)
+    if not sound or (len(data) and min(row.min(), column.min()) < 0):
+        raise ValueError(f"is a matrix of ({rows}, {columns}); expected {JOINTS} rows, and indices that match its data")
     dense = np.zeros((rows, columns))
     np.add.at(dense, (row, column), data)
     return dense
@@ -318,25 +297,21 @@ def read_masks(path: Path, names: str) -> list[int]:
         names: masks, several joined by "+" ("lips", "forehead+eye_region"), or without the vertices of others after "-"
             ("face-left_eyeball-right_eyeball"); the whole list if empty.
     """
-    loaded = load_pickle(path)
-    if names and not isinstance(loaded, dict):
-        raise FaceDiffError(f"{path}: expected a dict from mask to vertex indices, got {type(loaded).__name__}")
+    content = load_pickle(path)
     included, excluded = [], []
-    for part in names.split("+") if names else []:
-        # A mask may have a hyphen in its own name.
-        first, *others = [part] if part in loaded else part.split("-")
-        included.append(first)
-        excluded += others
-    for name in [*included, *excluded]:
-        if name not in loaded:
-            raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, loaded)))}')
-    try:
-        chosen = [loaded[name] for name in [*included, *excluded]] if names else [loaded]
-        arrays = [np.asarray(mask) for mask in chosen]
-    except ValueError as error:
-        raise FaceDiffError(f"{path}: expected lists of vertex indices ({error})") from error
-    if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):
-        raise FaceDiffError(f"{path}: expected lists of whole numbers, the vertex indices")
+    with damaged(path, "expected a dict from masks to lists of vertex indices"):
+        for part in names.split("+") if names else []:
+            # A mask may have a hyphen in its own name.
+            first, *rest = [part] if part in content else part.split("-")
+            included.append(first)
+            excluded += rest
+        for name in [*included, *excluded]:
+            if name not in content:
+                raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, content)))}')
+        masks = [content[name] for name in [*included, *excluded]] if names else [content]
+        arrays = [np.asarray(mask) for mask in masks]
+        if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):
+            raise ValueError("holds other values than whole numbers")
     count = len(included) if names else 1
     without = {int(index) for array in arrays[count:] for index in array}
     return [int(index) for array in arrays[:count] for index in array if int(index) not in without]

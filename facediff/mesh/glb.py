@@ -1,21 +1,23 @@
-"""Binary glTF 2.0 files from elsewhere: their data, checked before it is believed.
+"""Reader of binary glTF 2.0 files: accessors, buffer views and primitives, with checked sizes.
 
 Khronos Group, "glTF 2.0 Specification": sections 3.6 (binary data, accessors, sparse accessors), 3.7.2 (meshes) and 4.4
-(GLB). What a file shows is in :mod:`facediff.mesh.glb_scene`. Extensions are not read, and no other file is opened.
+(GLB). :mod:`facediff.mesh.glb_scene` places the meshes. Extensions are not read, and no other file is opened. Damaged
+files raise ValueError, LookupError and the like: open them within :func:`facediff.errors.damaged`.
 """
 
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.mesh.mesh import Array
-from facediff.utils.plain_files import parse_json
+from facediff.utils.plain_files import parse_json, read_bytes
 
 TYPES: dict[int, np.dtype[Any]] = {
     5120: np.dtype("i1"),
@@ -25,13 +27,12 @@ TYPES: dict[int, np.dtype[Any]] = {
     5125: np.dtype("<u4"),
     5126: np.dtype("<f4"),
 }
+UNSIGNED = {code: kind for code, kind in TYPES.items() if kind.kind == "u"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 INDICES = ("u1", "u2", "u4")
 POSITIONS = ("f4", "i1", "u1", "i2", "u2")  # whole numbers by the extension KHR_mesh_quantization
 TRIANGLES, STRIP, FAN = 4, 5, 6
 JSON, BINARY = 0x4E4F534A, 0x004E4942
-DAMAGED = (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError)
-"""Errors that reading a damaged file ends with; each door that opens one catches them and names the file."""
 
 
 class Glb:
@@ -50,8 +51,6 @@ class Glb:
         at = 12
         while at + 8 <= len(data):
             size, kind = struct.unpack_from("<II", data, at)
-            if at + 8 + size > len(data):
-                raise ValueError("has data beyond its end")
             chunks.setdefault(kind, data[at + 8 : at + 8 + size])
             at += 8 + size
         self.content: dict[str, Any] = parse_json(chunks.get(JSON, b""), source, remedy="export it again")
@@ -67,19 +66,19 @@ class Glb:
 
     def entries(self, kind: str, holder: dict[str, Any] | None = None) -> list[dict[str, Any]]:
         """A list of objects, such as ``nodes``, of the file or of one of its objects; empty if there is none."""
-        listed: list[dict[str, Any]] = (self.content if holder is None else holder).get(kind, [])
-        return listed
+        objects: list[dict[str, Any]] = (self.content if holder is None else holder).get(kind, [])
+        return objects
 
     def put_first(self, animation: dict[str, Any]) -> None:
-        """Add an animation before those of the file: Blender and viewers play the first one of themselves."""
+        """Add an animation before the file's own: Blender and viewers start with the first one."""
         self.content["animations"] = [animation, *self.entries("animations")]
 
     def entry(self, kind: str, index: object) -> dict[str, Any]:
         """An object by its number; numbers from the end, which Python would accept, are refused."""
-        listed: list[dict[str, Any]] = self.content.get(kind, [])
-        if type(index) is not int or not 0 <= index < len(listed):
+        objects: list[dict[str, Any]] = self.content.get(kind, [])
+        if type(index) is not int or not 0 <= index < len(objects):
             raise ValueError(f"names {kind.removesuffix('s')} {str(index)[:20]}, which does not exist")
-        return listed[index]
+        return objects[index]
 
     def numbers(self, index: object, form: str, kinds: tuple[str, ...], count: int | None = None) -> npt.NDArray[Any]:
         """An accessor's numbers (N, width); normalised whole numbers become those from -1 to 1 that they stand for.
@@ -91,7 +90,11 @@ class Glb:
             count: how many there must be. A sparse accessor without data states no size that could be trusted.
         """
         accessor = self.entry("accessors", index)
-        kind, stated, width = TYPES.get(whole(accessor, "componentType")), whole(accessor, "count"), WIDTHS[form]
+        kind, stated, width = (
+            TYPES.get(whole_number(accessor, "componentType")),
+            whole_number(accessor, "count"),
+            WIDTHS[form],
+        )
         if kind is None or kind.str[1:] not in kinds or accessor.get("type") != form:
             raise ValueError("holds positions or indices of an unknown type: export it without compression")
         if count is not None and stated != count:
@@ -104,11 +107,9 @@ class Glb:
             raise ValueError("has a mesh without data, perhaps a compressed one: export it without compression")
         if "sparse" in accessor:
             sparse = accessor["sparse"]
-            changed, at = whole(sparse, "count"), sparse["indices"]
-            places = self._slab(at, TYPES[whole(at, "componentType")], changed, 1)[:, 0].astype(np.int64)
-            if len(places) and not 0 <= places.min() <= places.max() < stated:
-                raise ValueError("names a vertex that does not exist")
-            values[places] = self._slab(sparse["values"], kind, changed, width)
+            changed, at = whole_number(sparse, "count"), sparse["indices"]
+            rows = self._slab(at, UNSIGNED[whole_number(at, "componentType")], changed, 1)[:, 0]
+            values[rows] = self._slab(sparse["values"], kind, changed, width)
         if accessor.get("normalized") is True and kind.kind in "iu":
             return np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1.0)
         return values
@@ -116,11 +117,15 @@ class Glb:
     def _slab(self, at: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> npt.NDArray[Any]:
         """Numbers (count, width) from the buffer view and offset that an object names."""
         view = self.entry("bufferViews", at.get("bufferView"))
-        if whole(view, "buffer", 0) != 0 or "uri" in self.entry("buffers", 0):
+        if whole_number(view, "buffer", 0) != 0 or "uri" in self.entry("buffers", 0):
             raise ValueError("keeps its data in another file")
         row = kind.itemsize * width
-        start, offset, length = whole(view, "byteOffset", 0), whole(at, "byteOffset", 0), whole(view, "byteLength")
-        stride = whole(view, "byteStride", row)
+        start, offset, length = (
+            whole_number(view, "byteOffset", 0),
+            whole_number(at, "byteOffset", 0),
+            whole_number(view, "byteLength"),
+        )
+        stride = whole_number(view, "byteStride", row)
         if not count:
             return np.empty((0, width), kind)
         # The last row need not be followed by its whole stride, as interleaved exporters write it.
@@ -131,7 +136,7 @@ class Glb:
     def piece(self, view: object) -> bytes:
         """The bytes of a buffer view."""
         entry = self.entry("bufferViews", view)
-        return self._slab({"bufferView": view}, TYPES[5121], whole(entry, "byteLength"), 1).tobytes()
+        return self._slab({"bufferView": view}, TYPES[5121], whole_number(entry, "byteLength"), 1).tobytes()
 
     def primitives(self, mesh: int) -> list[dict[str, Any]]:
         """The parts of a mesh."""
@@ -143,7 +148,7 @@ class Glb:
 
     def triangles(self, primitive: dict[str, Any], n_vertices: int) -> npt.NDArray[np.int64]:
         """Triangles (F, 3) of a primitive: a list, a strip or a fan of them."""
-        mode = whole(primitive, "mode", TRIANGLES)
+        mode = whole_number(primitive, "mode", TRIANGLES)
         if primitive.get("indices") is None:
             corners = np.arange(n_vertices, dtype=np.int64)
         else:
@@ -151,8 +156,6 @@ class Glb:
         if len(corners) and corners.max() >= n_vertices:
             raise ValueError("its triangles name a vertex that does not exist")
         if mode == TRIANGLES:
-            if len(corners) % 3:
-                raise ValueError("its last triangle is not complete")
             return corners.reshape(-1, 3)
         if mode == STRIP:
             strip = np.stack([corners[:-2], corners[1:-1], corners[2:]], 1)
@@ -165,12 +168,12 @@ class Glb:
 
 
 def attributes(primitive: dict[str, Any]) -> dict[str, Any]:
-    """Which accessor holds which of a primitive's attributes."""
+    """The numbers of the accessors of a primitive's attributes, by name."""
     by_name: dict[str, Any] = primitive["attributes"]
     return by_name
 
 
-def whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
+def whole_number(holder: dict[str, Any], key: str, default: int | None = None) -> int:
     """A whole number that is not negative, of an object."""
     value = holder.get(key, default)
     if type(value) is not int or value < 0:
@@ -179,21 +182,16 @@ def whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
 
 
 def open_glb(path: Path) -> Glb:
-    """A file from elsewhere."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); expected a .glb file") from error
-    return Glb(data, path)
+    """The content of a .glb file."""
+    return Glb(read_bytes(path, remedy="expected a .glb file"), path)
 
 
-def wears_more(path: Path) -> bool:
-    """Whether a file is a .glb with what its surface alone lacks: materials, skins or targets of shapes."""
+def has_materials_or_targets(path: Path) -> bool:
+    """Whether a file is a .glb with materials, skins or morph targets, which a mesh alone lacks."""
     if path.suffix.lower() != ".glb":
         return False
-    try:
+    with suppress(FaceDiffError), damaged(path, ""):  # the reader of meshes says what is wrong
         glb = open_glb(path)
         parts = [part for mesh in range(len(glb.entries("meshes"))) for part in glb.primitives(mesh)]
         return bool(glb.entries("materials") or glb.entries("skins") or any("targets" in part for part in parts))
-    except DAMAGED:  # the reader of meshes says what is wrong
-        return False
+    return False

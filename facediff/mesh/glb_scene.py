@@ -1,4 +1,4 @@
-"""What a binary glTF 2.0 file shows: its scene's meshes where nodes and skins put them, part by part.
+"""Scenes of binary glTF 2.0 files: the meshes where nodes and skins place them, part by part.
 
 Khronos Group, "glTF 2.0 Specification": sections 3.5 (scenes, nodes, transforms) and 3.7.3 (skins). Images and
 extensions are not read.
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.mesh.glb import Glb, attributes, whole
+from facediff.mesh.glb import Glb, attributes, whole_number
 from facediff.mesh.mesh import Array, Mesh
 from facediff.utils.colours import to_srgb
 
@@ -33,10 +33,10 @@ class Placed:
         mesh: number of its mesh.
         node: number of the node; -1 in a file without nodes.
         primitive: its description in the file, which may be changed.
-        names: those of the node, the mesh and the material, where they have one.
+        names: of the node, the mesh and the material, where they have one.
         material: its description in the file; empty if there is none.
         local: (V, 3) vertices as the file has them.
-        matrix: (4, 4) or (V, 4, 4) what places them; None if they stay.
+        matrix: (4, 4) or (V, 4, 4) transform that places them; None if they stay.
         faces: (F, 3) triangles, counter-clockwise seen from outside once they are placed.
     """
 
@@ -51,7 +51,7 @@ class Placed:
 
     @property
     def turn(self) -> Array:
-        """(3, 3) or (V, 3, 3) what turns and scales displacements."""
+        """(3, 3) or (V, 3, 3) linear part, which acts on displacements."""
         return np.eye(3) if self.matrix is None else self.matrix[..., :3, :3]
 
     @property
@@ -62,11 +62,11 @@ class Placed:
         return self.turned(self.local) + self.matrix[..., :3, 3]
 
     def turned(self, moves: Array) -> Array:
-        """Displacements (…, V, 3) of the file's vertices as those of the shown ones."""
+        """Displacements (…, V, 3) from the file's axes to the scene's."""
         return np.asarray((self.turn @ moves[..., None])[..., 0])
 
     def returned(self, moves: Array) -> Array:
-        """Displacements (…, V, 3) of the shown vertices as those of the file's."""
+        """Displacements (…, V, 3) from the scene's axes to the file's."""
         return np.asarray((np.linalg.inv(self.turn) @ moves[..., None])[..., 0])
 
 
@@ -87,13 +87,13 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
                 continue  # points and lines
             matrix = nodes.get(node)
             if "skin" in entry and "JOINTS_0" in attributes(primitive):
-                number = whole(entry, "skin")
+                number = whole_number(entry, "skin")
                 if number not in skins:
                     skins[number] = _stands(glb, number, nodes)
                 if len(skins[number]):
                     matrix = _skinned(glb, skins[number], primitive, len(local))
-            # A scale below zero turns a mesh inside out; its triangles are turned round so that they face outwards
-            # again. A skin has a matrix per vertex, of which the mean decides.
+            # A scale below zero turns a mesh inside out; its triangles are reversed so that they face outwards again. A
+            # skin has a matrix per vertex, of which the mean decides.
             mirrored = matrix is not None and np.linalg.det(matrix[..., :3, :3].reshape(-1, 3, 3).mean(axis=0)) < 0
             index = primitive.get("material")
             material = materials[index] if type(index) is int and 0 <= index < len(materials) else {}
@@ -114,11 +114,11 @@ def read_glb(data: bytes, source: object) -> Mesh:
     vertices, triangles = np.concatenate(points), np.concatenate(faces).astype(np.int32)
     if all(colour is None for colour in colours):
         return Mesh(vertices, triangles)
-    shown = [
+    tints = [
         np.broadcast_to(PLAIN if colour is None else colour, one.shape)
         for colour, one in zip(colours, points[1:], strict=True)
     ]
-    return Mesh(vertices, triangles, np.concatenate(shown))
+    return Mesh(vertices, triangles, np.concatenate(tints))
 
 
 def _colours(glb: Glb, part: Placed) -> Any:  # noqa: ANN401 - sRGB bytes (V, 3) or (3,), or None
@@ -149,7 +149,7 @@ def _shown(glb: Glb, nodes: dict[int, Array | None]) -> list[tuple[int, int]]:
     """The scene's meshes with the nodes that show them, -1 in a file without nodes."""
     if not glb.entries("nodes"):
         return [(index, -1) for index in range(len(glb.entries("meshes")))]
-    return [(whole(entry, "mesh"), index) for index in nodes if "mesh" in (entry := glb.entry("nodes", index))]
+    return [(whole_number(entry, "mesh"), index) for index in nodes if "mesh" in (entry := glb.entry("nodes", index))]
 
 
 def placed_nodes(glb: Glb) -> dict[int, Array | None]:
@@ -170,8 +170,8 @@ def placed_nodes(glb: Glb) -> dict[int, Array | None]:
         node = glb.entry("nodes", index)
         if index in placed:
             raise ValueError(f"its node {index} is below two others, or below itself")
-        own = node_matrix(node)
-        placed[index] = own if parent is None else parent if own is None else parent @ own
+        local = node_matrix(node)
+        placed[index] = local if parent is None else parent if local is None else parent @ local
         queue += [(child, placed[index]) for child in node.get("children", [])]
     return placed
 
@@ -183,7 +183,7 @@ def _stands(glb: Glb, index: int, nodes: dict[int, Array | None]) -> Array:
     if not joints or not all(type(joint) is int and joint in nodes for joint in joints):
         return np.zeros((0, 4, 4))
     # A joint's matrix times its inverse bind matrix is the identity in the pose that the skin was bound in.
-    placed = np.stack([np.eye(4) if (own := nodes[joint]) is None else own for joint in joints])
+    placed = np.stack([np.eye(4) if (matrix := nodes[joint]) is None else matrix for joint in joints])
     if "inverseBindMatrices" not in skin:
         return placed
     binds = glb.numbers(skin["inverseBindMatrices"], "MAT4", ("f4",))
@@ -194,26 +194,24 @@ def _stands(glb: Glb, index: int, nodes: dict[int, Array | None]) -> Array:
 
 
 def _skinned(glb: Glb, stands: Array, primitive: dict[str, Any], count: int) -> Array | None:
-    """What places the vertices of a skinned primitive, whose own node does not: (4, 4), (V, 4, 4), or None."""
+    """The transform of a skinned primitive, in place of its node's: (4, 4), (V, 4, 4), or None."""
     mean = stands.mean(axis=0)
     if np.abs(stands - mean).max() <= ALIKE * np.abs(mean).max():
         return None if np.abs(mean - np.eye(4)).max() <= ALIKE else mean
-    own = attributes(primitive)
+    accessors = attributes(primitive)
     placed, total = np.zeros((count, 4, 4)), np.zeros(count)
     for k in range(MOST_SETS):
-        if f"JOINTS_{k}" not in own:
+        if f"JOINTS_{k}" not in accessors:
             break
-        slots = glb.numbers(own[f"JOINTS_{k}"], "VEC4", JOINTS, count).astype(np.int64)
-        shares = glb.numbers(own.get(f"WEIGHTS_{k}"), "VEC4", WEIGHTS, count).astype(np.float64)
-        if slots.max(initial=0) >= len(stands):
-            raise ValueError("has vertices that name a joint which does not exist")
+        slots = glb.numbers(accessors[f"JOINTS_{k}"], "VEC4", JOINTS, count).astype(np.int64)
+        shares = glb.numbers(accessors.get(f"WEIGHTS_{k}"), "VEC4", WEIGHTS, count).astype(np.float64)
         for slot, share in zip(slots.T, shares.T, strict=True):
             placed += share[:, None, None] * stands[slot]
             total += share
     # Vertices without any weight would collapse into the origin; as in the common viewers, the first joint takes
     # them.
-    lost = ~(total > 0)
-    placed[lost], total[lost] = stands[0], 1.0
+    unweighted = ~(total > 0)
+    placed[unweighted], total[unweighted] = stands[0], 1.0
     return np.asarray(placed / total[:, None, None])
 
 
@@ -223,10 +221,7 @@ def node_matrix(node: dict[str, Any]) -> Array | None:
         return None
 
     def given(key: str, default: list[float]) -> Array:
-        values = np.array(node.get(key, default), np.float64)
-        if values.shape != (len(default),):
-            raise ValueError(f"a node's {key} has not {len(default)} numbers")
-        return values
+        return np.array(node.get(key, default), np.float64).reshape(len(default))
 
     matrix = given("matrix", np.eye(4).ravel().tolist()).reshape(4, 4).T.copy()
     rotation = given("rotation", [0, 0, 0, 1])

@@ -34,8 +34,8 @@ def read_targets(glb: Glb, vertices: int | None = None) -> Targets:
     Args:
         glb: the file.
         vertices: of the mesh that they are for: the mesh with the most targets, the parts that have targets, or all
-            parts of the scene as :func:`facediff.mesh.read_mesh` joins them, whichever has as many. None for the
-            parts that have targets, in the scene: of an avatar these are head, teeth and eyes.
+            parts of the scene as :func:`facediff.mesh.read_mesh` joins them: the first with as many vertices. None for
+            the parts that have targets, in the scene: of an avatar these are head, teeth and eyes.
     """
     counts = [
         max((len(glb.entries("targets", primitive)) for primitive in glb.primitives(index)), default=0)
@@ -76,15 +76,15 @@ def _joined(glb: Glb, parts: list[Placed]) -> Targets:
     """Parts one after the other; targets of one name are one shape, and a part that lacks it stands still."""
     # An avatar's head, teeth and lashes each have a target called jawOpen: by name they are one shape again.
     columns: dict[str, int] = {}
-    named = []
+    names_by_part = []
     for part in parts:
         names = _names(glb, part.mesh, part.primitive)
-        named.append(names)
+        names_by_part.append(names)
         for name in names:
             columns.setdefault(name, len(columns))
     total = sum(len(part.local) for part in parts)
     neutral, deltas, faces, before = np.zeros((total, 3)), np.zeros((len(columns), total, 3)), [], 0
-    for part, names in zip(parts, named, strict=True):
+    for part, names in zip(parts, names_by_part, strict=True):
         rows = slice(before, before + len(part.local))
         neutral[rows] = part.points
         for name, target in zip(names, glb.entries("targets", part.primitive), strict=True):
@@ -99,7 +99,7 @@ def _joined(glb: Glb, parts: list[Placed]) -> Targets:
 
 
 def target_names(glb: Glb, mesh: int) -> list[str]:
-    """Names of a mesh's targets: its own, or those of its first primitive that has targets."""
+    """Names of a mesh's targets, by the mesh or by its first primitive that has targets."""
     primitives = glb.primitives(mesh)
     return _names(glb, mesh, next((one for one in primitives if glb.entries("targets", one)), {}))
 
@@ -113,8 +113,8 @@ def _names(glb: Glb, mesh: int, primitive: dict[str, Any]) -> list[str]:
         names = extras.get("targetNames") if isinstance(extras, dict) else None
         if isinstance(names, list) and len(names) == count and all(isinstance(name, str) for name in names):
             if len(set(names)) < count:
-                twice = next(name for name in names if names.count(name) > 1)
-                raise ValueError(f'has two targets "{twice}" in one mesh; rename one of them and export it again')
+                double = next(name for name in names if names.count(name) > 1)
+                raise ValueError(f'has two targets "{double}" in one mesh; rename one of them and export it again')
             return names
     if count:
         raise ValueError(f"has {count} targets and other names for them; export it with targetNames")

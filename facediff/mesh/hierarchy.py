@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, needs_extra
+from facediff.errors import FaceDiffError, damaged, needs_extra
 from facediff.mesh.mesh import Array, closest_on_triangles
 from facediff.mesh.spirals import Indices, Points, checked_faces, spirals
 from facediff.utils.arrays import read_arrays
@@ -66,7 +66,7 @@ class MeshHierarchy:
 
     Attributes:
         n_vertices: vertices of the whole template.
-        vertices: those of the template that the finest level consists of, ascending; None if it has all of them.
+        vertices: the template's vertices of the finest level, ascending; None if it has all of them.
         levels: finest first; one more than the number of down-samplings.
     """
 
@@ -76,24 +76,24 @@ class MeshHierarchy:
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """All of it as named plain arrays, from which :meth:`from_arrays` makes an equal one."""
-        named: dict[str, npt.NDArray[Any]] = {"n_vertices": np.array(self.n_vertices)}
+        arrays: dict[str, npt.NDArray[Any]] = {"n_vertices": np.array(self.n_vertices)}
         if self.vertices is not None:
-            named["vertices"] = self.vertices.astype(np.int32)
+            arrays["vertices"] = self.vertices.astype(np.int32)
         for number, level in enumerate(self.levels):
-            named[f"{number}.faces"] = level.faces.astype(np.int32)
-            named[f"{number}.spirals"] = level.spirals.astype(np.int32)
+            arrays[f"{number}.faces"] = level.faces.astype(np.int32)
+            arrays[f"{number}.spirals"] = level.spirals.astype(np.int32)
             for name, operator in (("down", level.down), ("up", level.up)):
                 if operator is not None:
-                    named[f"{number}.{name}.rows"] = operator.rows.astype(np.int32)
-                    named[f"{number}.{name}.columns"] = operator.columns.astype(np.int32)
-                    named[f"{number}.{name}.weights"] = operator.weights
-        return named
+                    arrays[f"{number}.{name}.rows"] = operator.rows.astype(np.int32)
+                    arrays[f"{number}.{name}.columns"] = operator.columns.astype(np.int32)
+                    arrays[f"{number}.{name}.weights"] = operator.weights
+        return arrays
 
     @classmethod
-    def from_arrays(cls, named: Mapping[str, npt.ArrayLike]) -> MeshHierarchy:
+    def from_arrays(cls, content: Mapping[str, npt.ArrayLike]) -> MeshHierarchy:
         """The hierarchy that :meth:`arrays` described."""
-        try:
-            arrays = {name: np.asarray(array) for name, array in named.items()}
+        with damaged("mesh hierarchy", "compute it again from the template"):
+            arrays = {name: np.asarray(array) for name, array in content.items()}
             sizes: list[int] = []
             while f"{len(sizes)}.spirals" in arrays:
                 sizes.append(len(arrays[f"{len(sizes)}.spirals"]))
@@ -101,30 +101,21 @@ class MeshHierarchy:
             vertices = arrays["vertices"].astype(np.int64) if "vertices" in arrays else None
             n_vertices = int(arrays["n_vertices"])
             if not levels or sizes[0] != (n_vertices if vertices is None else len(vertices)):
-                raise ValueError("levels")
-        except (KeyError, ValueError, IndexError, TypeError) as error:
-            raise FaceDiffError(
-                f"mesh hierarchy: its arrays are not complete or do not fit one another ({error}); compute it again "
-                f"from the template"
-            ) from error
+                raise ValueError("its levels do not match its vertices")
         return cls(n_vertices, vertices, levels)
 
 
 def _level(arrays: Mapping[str, npt.NDArray[Any]], number: int, sizes: list[int]) -> MeshLevel:
-    """Raises KeyError or ValueError if an array is missing or an index is out of its range."""
-
     def within(name: str, size: int, dimensions: int) -> Indices:
         index = arrays[f"{number}.{name}"]
         if index.ndim != dimensions or (index.size and not (index.min() >= 0 and index.max() < size)):
-            raise ValueError("an index out of range")
+            raise ValueError(f"{number}.{name} holds an index out of range")
         return index.astype(np.int64)
 
     def operator(name: str, rows: int, columns: int) -> Operator:
         row, column = within(f"{name}.rows", rows, 1), within(f"{name}.columns", columns, 1)
         weights = arrays[f"{number}.{name}.weights"].astype(np.float32)
-        if not row.shape == column.shape == weights.shape:
-            raise ValueError(name)
-        return Operator(row, column, weights, (rows, columns))
+        return Operator(row, column.reshape(row.shape), weights.reshape(row.shape), (rows, columns))
 
     size, coarse = sizes[number], (*sizes, 0)[number + 1]
     table, faces = within("spirals", size, 2), within("faces", size, 2)
@@ -163,17 +154,17 @@ def mesh_hierarchy(
     """
     template = np.asarray(np.asarray(template, np.float32), np.float64)
     faces = checked_faces(faces, len(template))
-    chosen = None if vertices is None else np.unique(vertices)
-    key = _key(template, faces, chosen, [levels, factor, spiral_length, dilation, pooling])
+    selection = None if vertices is None else np.unique(vertices)
+    key = _key(template, faces, selection, [levels, factor, spiral_length, dilation, pooling])
     # Three levels of a dense mesh take some seconds, and every training on its corpus needs the same ones.
     path = (cache or cache_dir() / "topology") / f"{key}.npz"
     with suppress(ValueError, KeyError, FaceDiffError):  # there is no such file, or it is damaged
         return MeshHierarchy.from_arrays(read_arrays(path))
     points, inner = template, faces
-    if chosen is not None:
-        place = np.full(len(template), -1)
-        place[chosen] = np.arange(len(chosen))
-        points, inner = template[chosen], place[faces][(place[faces] >= 0).all(axis=1)]
+    if selection is not None:
+        row = np.full(len(template), -1)
+        row[selection] = np.arange(len(selection))
+        points, inner = template[selection], row[faces][(row[faces] >= 0).all(axis=1)]
     mesh_levels = []
     for _ in range(levels):
         coarse = coarsen(points, inner, -(-len(points) // factor), pooling)
@@ -182,7 +173,7 @@ def mesh_hierarchy(
         points, inner = coarse.template, coarse.faces
     table = spirals(inner, len(points), spiral_length, dilation, points)
     mesh_levels.append(MeshLevel(len(points), inner, table, None, None))
-    hierarchy = MeshHierarchy(len(template), chosen, tuple(mesh_levels))
+    hierarchy = MeshHierarchy(len(template), selection, tuple(mesh_levels))
     with suppress(FaceDiffError), atomic(path) as temporary:  # a hierarchy that cannot be cached is computed again
         np.savez(temporary, allow_pickle=False, **hierarchy.arrays())
     return hierarchy
@@ -196,7 +187,7 @@ def _key(template: Points, faces: Indices, vertices: Indices | None, options: li
         library = "none"
     shapes = [len(template), len(faces), -1 if vertices is None else len(vertices)]
     digest = hashlib.sha256(json.dumps([VERSION, library, shapes, options]).encode())
-    # Little-endian, whatever the machine: one cache may be shared by several.
+    # Little-endian on all machines: one cache may be shared by several.
     digest.update(template.astype("<f4").tobytes())
     digest.update(faces.astype("<i8").tobytes())
     if vertices is not None:
@@ -220,7 +211,7 @@ AGGRESSION = 7.0  # Power of the passes' thresholds; the simplifier's own defaul
 class Coarse:
     """A mesh with fewer vertices, and its relation to the one that it was made from."""
 
-    template: Array  # (M, 3) positions: those of the chosen vertices, or the clusters' means
+    template: Array  # (M, 3) positions of the representative vertices, or the clusters' means
     faces: Indices  # (G, 3) vertex indices; no face names a vertex twice and no two faces have the same vertices
     clusters: Indices  # (V,) which coarse vertex each vertex became part of
     down: Operator  # from the V vertices to the M coarse ones
@@ -246,11 +237,13 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     square = np.square(points - _means(labels, n_vertices).apply(points)[labels]).sum(axis=1)
     # Ties go to the smaller number, so that a hierarchy depends on the mesh alone and a checkpoint finds it again.
     order = np.lexsort((np.arange(len(points)), square, labels))
-    chosen = order[np.searchsorted(labels[order], np.arange(n_vertices))]
-    # Coarse vertices are numbered in the order of the chosen ones.
-    clusters, chosen = np.argsort(np.argsort(chosen))[labels], np.sort(chosen)
+    representatives = order[np.searchsorted(labels[order], np.arange(n_vertices))]
+    # Coarse vertices are numbered in the order of their representatives.
+    clusters, representatives = np.argsort(np.argsort(representatives))[labels], np.sort(representatives)
     if pooling == "select":
-        down = Operator(np.arange(n_vertices), chosen, np.ones(n_vertices, np.float32), (n_vertices, len(points)))
+        down = Operator(
+            np.arange(n_vertices), representatives, np.ones(n_vertices, np.float32), (n_vertices, len(points))
+        )
     else:
         down = _means(clusters, n_vertices)
     coarse = down.apply(points)
@@ -259,8 +252,8 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     coarse_faces = coarse_faces[np.sort(np.unique(np.sort(coarse_faces, axis=1), axis=0, return_index=True)[1])]
     corners, weights = project(points, coarse, coarse_faces, clusters)
     # Weights of zero would make the operators larger for nothing: a point on an edge has two corners.
-    rows, places = np.nonzero(weights > 0)
-    up = Operator(rows, corners[rows, places], weights[rows, places].astype(np.float32), (len(points), n_vertices))
+    rows, slots = np.nonzero(weights > 0)
+    up = Operator(rows, corners[rows, slots], weights[rows, slots].astype(np.float32), (len(points), n_vertices))
     return Coarse(coarse, coarse_faces, clusters, down, up)
 
 
@@ -274,19 +267,19 @@ def _clusters(points: Array, faces: Indices, n_vertices: int) -> Indices:
     """(V,) numbers 0 … n_vertices - 1 of the cluster of every vertex."""
     roots = np.arange(len(points))
     spare = len(points) - n_vertices
-    used = np.unique(faces)
-    if len(used) and spare:
+    in_faces = np.unique(faces)
+    if len(in_faces) and spare:
         # Vertices without faces never collapse: they are merged first, the nearest to the surface before the others,
         # and the simplifier makes up for the rest.
-        loose = np.setdiff1d(roots, used)
-        near, distance = _nearest(points[loose], points[used])
+        loose = np.setdiff1d(roots, in_faces)
+        near, distance = _nearest(points[loose], points[in_faces])
         loose, near = (part[np.argsort(distance, kind="stable")][:spare] for part in (loose, near))
-        pairs = _collapses(points[used], np.searchsorted(used, faces), max(len(used) - spare + len(loose), 1))
-        kept, gone = used[pairs[: spare - len(loose)].T]
+        count = max(len(in_faces) - spare + len(loose), 1)
+        pairs = in_faces[_collapses(points[in_faces], np.searchsorted(in_faces, faces), count)[: spare - len(loose)]]
         # The last collapse first: by then it is known where the vertex that stays ends up.
-        for stays, goes in zip(kept[::-1].tolist(), gone[::-1].tolist(), strict=True):
+        for stays, goes in pairs[::-1].tolist():
             roots[goes] = roots[stays]
-        roots[loose] = roots[used[near]]
+        roots[loose] = roots[in_faces[near]]
     labels = np.unique(roots, return_inverse=True)[1]
     # The decoder's layers have fixed sizes: a level must have exactly so many vertices.
     while labels.max() >= n_vertices:
@@ -335,20 +328,20 @@ def _merged(points: Array, faces: Indices, labels: Indices, n_vertices: int) -> 
         pairs = np.stack([every, np.where(near[:, 0] == every, near[:, 1], near[:, 0])], axis=1)
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     lengths = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
-    roots, taken, left = np.arange(count), np.zeros(count, bool), count - n_vertices
+    roots, merged, left = np.arange(count), np.zeros(count, bool), count - n_vertices
     for first, second in pairs[np.argsort(lengths, kind="stable")].tolist():
-        if left and not (taken[first] or taken[second]):
+        if left and not (merged[first] or merged[second]):
             roots[second], left = first, left - 1
-            taken[[first, second]] = True
+            merged[[first, second]] = True
     return np.unique(roots[labels], return_inverse=True)[1]
 
 
 def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> tuple[Indices, Array]:
     """The point on a coarse mesh (M, 3), (G, 3) nearest to each point (V, 3): corners of its face and their weights.
 
-    Searched for among the faces at the coarse vertex (V,) that a point belongs to and at that one's neighbours. Where
-    there are no such faces, the coarse vertex itself is taken. Weights are none negative and sum to one; of equally
-    near faces, the first counts.
+    The search covers the faces at the coarse vertex (V,) of a point and at its neighbours. Where there are no such
+    faces, the coarse vertex itself is the result. Weights are at least 0 and sum to one; of equally near faces, the
+    first counts.
     """
     from scipy.sparse import csr_array
 

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, OptionError, choices
-from facediff.mesh.glb import DAMAGED, open_glb
+from facediff.errors import FaceDiffError, OptionError, choices, damaged
+from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
+from facediff.utils.plain_files import read_bytes
 
 NAMING = {b"o": 0, b"g": 1, b"usemtl": 2}
 
@@ -27,27 +28,21 @@ class MeshPart:
 
 def mesh_parts(path: Path) -> list[MeshPart]:
     """The parts of a file that :func:`facediff.mesh.read_mesh` reads; none for formats that have no names."""
-    suffix = path.suffix.lower()
-    try:
-        if suffix == ".glb":
-            named = [(part.names, len(part.faces)) for part in placed_parts(open_glb(path))]
-        elif suffix == ".obj":
-            named = _obj_parts(path.read_bytes())
-        else:
-            named = []
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); expected a mesh") from error
-    except DAMAGED as error:
-        raise FaceDiffError(f"{path}: not a readable {suffix[1:].upper()} mesh ({error}); export it again") from error
+    runs: list[tuple[tuple[str, ...], int]] = []
+    with damaged(path, "export it again"):
+        if path.suffix.lower() == ".glb":
+            runs = [(part.names, len(part.faces)) for part in placed_parts(open_glb(path))]
+        elif path.suffix.lower() == ".obj":
+            runs = _obj_parts(read_bytes(path, remedy="expected a mesh"))
     parts, before = [], 0
-    for names, count in named:
+    for names, count in runs:
         parts.append(MeshPart(names, np.arange(before, before + count)))
         before += count
     return parts
 
 
 def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
-    r"""Which triangles of a file's mesh are in the parts that are named so; ``*`` stands for any letters.
+    r"""The triangles of a file's mesh that lie in parts with these names; ``*`` stands for any letters.
 
     Example:
         >>> import tempfile
@@ -62,7 +57,7 @@ def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
         raise OptionError.naming(
             f"{path}: its parts have no names; expected a .glb or .obj with named parts, or no {{part}}"
         )
-    chosen = []
+    triangles = []
     for pattern in names:
         stars = pattern.replace("[", "[[]").replace("?", "[?]")  # other signs stand for themselves
         for fold in (str, str.casefold):  # another case counts only where nothing is written so
@@ -71,8 +66,8 @@ def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
                 break
         else:
             raise FaceDiffError(f'{path}: has no part "{pattern}"; {choices(pattern, part_names)}')
-        chosen += [part.triangles for part in matching]
-    return np.unique(np.concatenate(chosen))
+        triangles += [part.triangles for part in matching]
+    return np.unique(np.concatenate(triangles))
 
 
 def _obj_parts(data: bytes) -> list[tuple[tuple[str, ...], int]]:

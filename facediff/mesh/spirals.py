@@ -56,7 +56,7 @@ def spirals(
 
 
 def checked_faces(faces: npt.NDArray[np.integer], n_vertices: int) -> Indices:
-    """Faces (F, 3) as int64, without those that name a vertex twice; an index that is not a vertex's is refused."""
+    """Faces (F, 3) as int64, without degenerate ones; refuses indices beyond the vertices."""
     corners = np.asarray(faces, np.int64).reshape(-1, 3)
     if corners.size and not (corners.min() >= 0 and corners.max() < n_vertices):
         raise FaceDiffError(
@@ -79,22 +79,22 @@ def ordered_rings(faces: Indices, n_vertices: int) -> list[list[int]]:
     # A face (a, b, c) seen from outside says that around a, the neighbour c follows b. A second follower of the same
     # neighbour is an edge with more than two faces, or two faces that wind against one another.
     for a, b, c in faces.tolist():
-        for vertex, here, there in ((a, b, c), (b, c, a), (c, a, b)):
-            if follows[vertex].setdefault(here, there) != there:
-                loose.setdefault(vertex, set()).add(there)
+        for vertex, neighbour, follower in ((a, b, c), (b, c, a), (c, a, b)):
+            if follows[vertex].setdefault(neighbour, follower) != follower:
+                loose.setdefault(vertex, set()).add(follower)
     rings = []
     for vertex, follow in enumerate(follows):
         # An open fan starts at the neighbour that follows no other; a closed one has no such neighbour.
         ends = set(follow.values())
         # Sorted, so that the order of a vertex's neighbours does not depend on the order of the faces in the file.
         starts = [*sorted(follow.keys() - ends), *sorted(follow.keys() & ends), *sorted(loose.get(vertex, ()))]
-        seen: dict[int, None] = {}  # a set that keeps its order
+        ring: dict[int, None] = {}  # a set that keeps its order
         for start in starts:
             step: int | None = start
-            while step is not None and step not in seen:
-                seen[step] = None
+            while step is not None and step not in ring:
+                ring[step] = None
                 step = follow.get(step)
-        rings.append(list(seen))
+        rings.append(list(ring))
     return rings
 
 
@@ -102,12 +102,12 @@ def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
     """The vertex and the rings around it, cut at ``full_length`` entries; shorter where the rings end."""
     ring = rings[vertex]
     spiral = [vertex, *ring]
-    seen = set(spiral)
+    visited = set(spiral)
     while ring and len(spiral) < full_length:
         outer: list[int] = []
         for inner in ring:
             around = rings[inner]
-            fresh = [near not in seen for near in around]
+            fresh = [near not in visited for near in around]
             if not any(fresh):
                 continue
             # The first new vertex after an old one, counter-clockwise: the outer ring goes on where the inner one
@@ -115,7 +115,7 @@ def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
             start = next((i for i, new in enumerate(fresh) if new and not fresh[i - 1]), 0)
             order = (*range(start, len(around)), *range(start))
             new = [around[i] for i in order if fresh[i]]
-            seen.update(new)
+            visited.update(new)
             outer += new
             if len(spiral) + len(outer) >= full_length:
                 break
@@ -126,17 +126,13 @@ def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
 
 def _nearest(vertex: int, spiral: list[int], full_length: int, template: Points | None) -> list[int]:
     """The vertices nearest to ``vertex`` that are not in the spiral, as many as it lacks."""
-    if template is None:
-        raise FaceDiffError(
-            f"spirals: the rings around vertex {vertex} hold {len(spiral)} vertices of {full_length}; give the "
-            f"template, so that the nearest vertices can fill the rest"
-        )
+    assert template is not None  # noqa: S101 - for type checkers
     square = np.square(np.asarray(template, np.float64) - np.asarray(template[vertex], np.float64)).sum(axis=1)
-    # What is in the spiral already must not come twice.
+    # No vertex comes twice.
     square[spiral] = np.inf
-    missing = full_length - len(spiral)
+    count = full_length - len(spiral)
     # A partition finds the distance of the last one needed without sorting all vertices.
-    reach = np.partition(square, missing - 1)[missing - 1]
+    reach = np.partition(square, count - 1)[count - 1]
     near = np.flatnonzero(square <= reach)  # by index, so that ties go to the smaller one
-    nearest: list[int] = near[np.argsort(square[near], kind="stable")][:missing].tolist()
+    nearest: list[int] = near[np.argsort(square[near], kind="stable")][:count].tolist()
     return nearest

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
-from facediff.mesh.glb import DAMAGED, Glb, attributes, open_glb, whole
+from facediff.errors import FaceDiffError, damaged
+from facediff.mesh.glb import Glb, attributes, open_glb, whole_number
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
 from facediff.utils.files import holds_glb
@@ -44,24 +44,24 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Textures:
-    """What a mesh file says of its surface.
+    """The surface of a mesh file.
 
     Attributes:
         uvs: (M, 2) texture coordinates, v upwards.
-        corners: (F, 3) which of them each corner of each triangle has, in the order of :func:`facediff.mesh.read_mesh`.
-        materials: those that triangles have.
+        corners: (F, 3) number of each corner's coordinate, triangles as :func:`facediff.mesh.read_mesh` reads them.
+        materials: the materials of the triangles.
         of_face: (F,) number of each triangle's material.
-        lost: what is not carried over, a sentence each.
+        losses: properties that are not carried over, a sentence each.
     """
 
     uvs: npt.NDArray[np.float64]
     corners: npt.NDArray[np.int64]
     materials: tuple[Material, ...]
     of_face: npt.NDArray[np.int64]
-    lost: tuple[str, ...] = ()
+    losses: tuple[str, ...] = ()
 
     def turned(self, triangles: npt.NDArray[np.integer], outward: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-        """The corners for triangles (F, 3) whose vertices come in another order."""
+        """The corners for the same triangles (F, 3) with their vertices in another order."""
         order = (outward[:, :, None] == triangles[:, None, :]).argmax(axis=2)
         return np.take_along_axis(self.corners, order, axis=1)
 
@@ -71,7 +71,7 @@ def has_textures(path: Path) -> bool:
     if not path.is_file():
         return False
     if path.suffix.lower() == ".glb":
-        with suppress(*DAMAGED):  # the reader of meshes says what is wrong
+        with suppress(FaceDiffError), damaged(path, ""):  # the reader of meshes says what is wrong
             return _has_picture(open_glb(path))
     if path.suffix.lower() != ".obj":
         return False
@@ -92,11 +92,8 @@ def read_textures(path: Path, n_triangles: int) -> Textures:
         n_triangles: of the mesh that it is of.
     """
     reader = {".glb": _read_glb, ".obj": _read_obj}.get(path.suffix.lower()) if path.is_file() else None
-    try:
+    with damaged(path, f"not a readable {path.suffix[1:].upper()} mesh, export it again"):
         surface = None if reader is None else reader(path)
-    except DAMAGED as error:
-        kind = path.suffix[1:].upper()
-        raise FaceDiffError(f"{path}: not a readable {kind} mesh ({error}); export it again") from error
     if surface is None:
         raise FaceDiffError(
             f"{path}: has no texture coordinates; expected an .obj with lines `vt u v`, or a .glb with a picture"
@@ -120,13 +117,13 @@ def _read_obj(path: Path) -> Textures | None:
             u, v = rest.split()[:2]
             uvs.append((float(u), float(v)))
         elif word == "f":
-            listed = [corner.split("/") for corner in rest.split()]
-            numbers = [int(corner[1]) if len(corner) > 1 and corner[1] else 0 for corner in listed]
+            cells = [corner.split("/") for corner in rest.split()]
+            numbers = [int(cell[1]) if len(cell) > 1 and cell[1] else 0 for cell in cells]
             # Numbers count from 1, or backwards from the coordinates read so far if they are negative; 0 is none.
-            places = [number - 1 if number > 0 else len(uvs) + number if number else -1 for number in numbers]
+            rows = [number - 1 if number > 0 else len(uvs) + number if number else -1 for number in numbers]
             # Polygons become fans, as in the mesh itself.
-            corners += [(places[0], b, c) for b, c in zip(places[1:-1], places[2:], strict=True)]
-            of_face += [current] * (len(places) - 2)
+            corners += [(rows[0], b, c) for b, c in zip(rows[1:-1], rows[2:], strict=True)]
+            of_face += [current] * (len(rows) - 2)
         elif word == "usemtl":
             current = names.setdefault(rest.strip(), len(names))
         elif word == "mtllib":
@@ -139,21 +136,21 @@ def _read_obj(path: Path) -> Textures | None:
     if (table < 0).any():  # corners without a coordinate get one of their own
         table[table < 0] = len(coordinates)
         coordinates = np.concatenate([coordinates, np.zeros((1, 2))])
-    lost: list[str] = []
-    library = _materials(path, libraries, lost)
-    used = np.unique(np.array(of_face))
+    losses: list[str] = []
+    library = _materials(path, libraries, losses)
+    numbers_in_use = np.unique(np.array(of_face))
     every = list(names)
-    materials = tuple(library.get(every[number], Material(every[number] or "surface")) for number in used)
-    return Textures(coordinates, table, materials, np.searchsorted(used, of_face), tuple(lost))
+    materials = tuple(library.get(every[number], Material(every[number] or "surface")) for number in numbers_in_use)
+    return Textures(coordinates, table, materials, np.searchsorted(numbers_in_use, of_face), tuple(losses))
 
 
-def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, Material]:
-    """Materials by their names; adds what is missing to ``lost``."""
+def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str, Material]:
+    """Materials by their names; adds a sentence to ``losses`` for each missing file or picture."""
     result: dict[str, Material] = {}
     for library in libraries:
         file = _beside(path, library)
         if file is None:
-            lost.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
+            losses.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
             continue
         name, left_out = "", set()
         for line in file.read_bytes().decode("utf-8", errors="replace").splitlines():
@@ -168,7 +165,7 @@ def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, M
                 text = rest.split()[-1] if rest.strip().startswith("-") else rest.strip()
                 picture = _beside(path, text)
                 if picture is None or not _is_picture(picture):
-                    lost.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
+                    losses.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
                 else:
                     result[name] = Material(name, result[name].colour, picture)
             elif word.lower().startswith(("map_", "bump", "norm")) or (
@@ -176,8 +173,9 @@ def _materials(path: Path, libraries: list[str], lost: list[str]) -> dict[str, M
             ):
                 left_out.add(word)
         if left_out:
-            words = ", ".join(sorted(left_out))
-            lost.append(f"colours and their pictures are carried over, and {words} of {library} left out")
+            losses.append(
+                f"colours and their pictures are carried over, and {', '.join(sorted(left_out))} of {library} left out"
+            )
     return result
 
 
@@ -214,7 +212,7 @@ ELSEWHERE = ("normalTexture", "occlusionTexture", "emissiveTexture", "alphaMode"
 
 
 def _base_picture(material: dict[str, Any]) -> dict[str, Any]:
-    """What a material says of the picture that colours it; empty if there is none."""
+    """A material's entry for its colour texture; empty if there is none."""
     look = material.get("pbrMetallicRoughness", {})
     texture = look.get("baseColorTexture", {}) if isinstance(look, dict) else {}
     return texture if isinstance(texture, dict) else {}
@@ -225,7 +223,7 @@ def _has_picture(glb: Glb) -> bool:
 
 
 def _read_glb(path: Path) -> Textures | None:
-    glb, lost = open_glb(path), list[str]()
+    glb, losses = open_glb(path), list[str]()
     if not _has_picture(glb):
         return None
     numbers: dict[int, int] = {}  # of the materials here, by those of the file's; -1 for parts without one
@@ -235,8 +233,10 @@ def _read_glb(path: Path) -> Textures | None:
         index = part.primitive["material"] if part.material else -1
         if index not in numbers:
             numbers[index] = len(materials)
-            materials.append(_material(glb, part.material, path, lost))
-        accessor = attributes(part.primitive).get(f"TEXCOORD_{whole(_base_picture(part.material), 'texCoord', 0)}")
+            materials.append(_material(glb, part.material, path, losses))
+        accessor = attributes(part.primitive).get(
+            f"TEXCOORD_{whole_number(_base_picture(part.material), 'texCoord', 0)}"
+        )
         coordinates = np.zeros((len(part.local), 2))
         if accessor is not None:
             coordinates += glb.numbers(accessor, "VEC2", ("f4", "u1", "u2"), len(part.local))
@@ -247,31 +247,32 @@ def _read_glb(path: Path) -> Textures | None:
     table = np.concatenate(uvs)
     left_out = sorted({word for material in glb.entries("materials") for word in ELSEWHERE if word in material})
     if left_out:
-        lost.append(f"colours and their pictures are carried over, and {', '.join(left_out)} of {path.name} left out")
+        losses.append(f"colours and their pictures are carried over, and {', '.join(left_out)} of {path.name} left out")
     # Material files of .obj need names of their own, for which glTF does not ask.
     counts = Counter(material.name for material in materials)
-    named = [
+    unique = [
         replace(material, name=f"{material.name}_{number}") if counts[material.name] > 1 else material
         for number, material in enumerate(materials)
     ]
-    return Textures(table, np.concatenate(corners), tuple(named), np.concatenate(of_face), tuple(lost))
+    return Textures(table, np.concatenate(corners), tuple(unique), np.concatenate(of_face), tuple(losses))
 
 
-def _material(glb: Glb, material: dict[str, Any], path: Path, lost: list[str]) -> Material:
-    """A material of a file as other formats have it; adds what is missing to ``lost``."""
+def _material(glb: Glb, material: dict[str, Any], path: Path, losses: list[str]) -> Material:
+    """A material of a file as other formats have it; adds a sentence to ``losses`` for a picture that is left out."""
     name = "_".join(str(material.get("name", "")).split()) or "surface"
     look, texture = material.get("pbrMetallicRoughness", {}), _base_picture(material)
     factor = look.get("baseColorFactor", [1, 1, 1, 1]) if isinstance(look, dict) else [1, 1, 1, 1]
-    if not isinstance(factor, list) or not all(type(value) in (int, float) and 0 <= value <= 1 for value in factor):
-        raise ValueError("has a material whose colour is none")
-    red, green, blue = (float(value) for value in to_srgb(np.array(factor[:3], np.float64)))
+    red, green, blue = (float(value) for value in to_srgb(np.array(factor[:3], np.float64).clip(0, 1)))
     if not texture:
         return Material(name, (red, green, blue))
     data = b""
-    with suppress(*DAMAGED):  # of a kind that glTF itself does not know, in another file, or damaged
+    # A picture may be of a kind that glTF itself does not know, in another file, or damaged.
+    with suppress(FaceDiffError), damaged(path, ""):
         image = glb.entry("images", glb.entry("textures", texture.get("index")).get("source"))
         data = glb.piece(image.get("bufferView"))
     if "KHR_texture_transform" in str(texture.get("extensions", "")) or not data.startswith(tuple(PICTURES)):
-        lost.append(f"the picture of {name} is no .png or .jpg in {path.name}, or moved on its surface: it is left out")
+        losses.append(
+            f"the picture of {name} is no .png or .jpg in {path.name}, or moved on its surface: it is left out"
+        )
         return Material(name, (red, green, blue))
     return Material(name, (red, green, blue), data)

@@ -283,7 +283,7 @@ class AnimationPipeline(ABC):
 
         # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates and pictures.
         target = Path(self.options.target_mesh or "")
-        is_dressed = holds_glb(output) and export.output_unit is None and self._target_wears_more
+        is_dressed = holds_glb(output) and export.output_unit is None and self._target_has_materials
         into = target if is_dressed or hands_on_textures(target, output) else None
         own_shapes = self.options.own_shapes
         if own_shapes and not is_dressed:
@@ -294,11 +294,11 @@ class AnimationPipeline(ABC):
             return written, animations[0]
 
     @cached_property
-    def _target_wears_more(self) -> bool:
+    def _target_has_materials(self) -> bool:
         """Whether the target mesh is a .glb that wears more than its surface."""
-        from facediff.mesh.glb import wears_more
+        from facediff.mesh.glb import has_materials_or_targets
 
-        return self.options.target_mesh is not None and wears_more(Path(self.options.target_mesh))
+        return self.options.target_mesh is not None and has_materials_or_targets(Path(self.options.target_mesh))
 
     @contextmanager
     def animations(

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.correspondence import Correspondence, correspond
-from facediff.editing.retargeting import carry, carry_checked
+from facediff.editing.retargeting import transfer, transfer_checked
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
 from facediff.mesh.flame import Flame
@@ -185,11 +185,11 @@ class Placement:
         target = Mesh(np.asarray(rig.neutral, np.float32), faces.astype(np.int32))
         if self._correspondence is None:
             fitted = correspond(animation.template, animation.triangles, target.vertices, faces)
-            carried, self._correspondence, report = carry_checked(animation, fitted, target)
+            carried, self._correspondence, report = transfer_checked(animation, fitted, target)
             if not report.good:
                 raise FaceDiffError(f"its face could not be carried to the open one: {report.faults[0]}")
         else:
-            carried = carry(animation, self._correspondence, target)
+            carried = transfer(animation, self._correspondence, target)
         return np.asarray(carried.vertices[:, self.face.points], np.float64)
 
 

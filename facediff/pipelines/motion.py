@@ -246,7 +246,7 @@ def view(
     from facediff.export.viewer.page import check_page
 
     number = None if truth is None else 0
-    check_page(shown, number)
+    check_page(shown)
     return Page(shown, number)
 
 
@@ -362,13 +362,13 @@ def solve_weights(
     """Shapes from a folder or a file as they fit an animation, and their weights: :meth:`Animation.blendshapes`."""
     from facediff.editing.blendshapes import solve
     from facediff.editing.retargeting import retarget_shapes
-    from facediff.editing.shapes import KEPT, check_shapes, read_shapes
+    from facediff.editing.shapes import EXTRA_NOTE, check_shapes, read_shapes
     from facediff.spaces.arkit import ARKIT
 
     check_shapes(shapes)
     found = retarget_shapes(shapes, animation) if carry else read_shapes(shapes, animation.template, animation.unit)
     if only_arkit:
-        notes = [note for note in found.notes if not note.startswith(KEPT)]
+        notes = [note for note in found.notes if not note.startswith(EXTRA_NOTE)]
         if found.extra:
             notes.append(f"not ARKit's, left out so that they take no motion: {', '.join(found.extra)}")
         found = replace(found.only(ARKIT), notes=tuple(notes))

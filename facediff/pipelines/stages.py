@@ -537,18 +537,18 @@ class Retarget(Stage):
                 sample.settle(self._retargeted(animation))
 
     def _retargeted(self, animation: Animation) -> Animation:
-        from facediff.editing.retargeting import carry, retarget, upright
+        from facediff.editing.retargeting import retarget, to_y_up, transfer
         from facediff.mesh import read_mesh
 
         if self.correspondence is not None:
-            carried = carry(animation, self.correspondence, read_mesh(self.mesh), self.own_shapes)
-            return upright(carried, self.correspondence)
+            carried = transfer(animation, self.correspondence, read_mesh(self.mesh), self.own_shapes)
+            return to_y_up(carried, self.correspondence)
         is_known = self.file is not None and self.file.exists()
         carried, self.correspondence = retarget(
             animation,
             self.mesh,
             self.file,
-            judge=None if is_known else self._judge,
+            check=None if is_known else self._judge,
             whole_head=self.own_shapes,
         )
         return carried

@@ -1,4 +1,4 @@
-"""Meshes for drawing: what can be drawn, which side is outside, normals and hollows."""
+"""Meshes for drawing: checked vertices, outward triangles, normals and hollows."""
 
 from __future__ import annotations
 
@@ -17,27 +17,21 @@ Floats = npt.NDArray[np.floating[Any]]
 
 
 def check_vertices(vertices: npt.ArrayLike, name: str, n_vertices: int | None = None) -> Float64:
-    """Vertex positions (V, 3) as float64; refuses other shapes, another mesh's, and what is not finite."""
+    """Vertex positions (V, 3) as float64; refuses other shapes and numbers that are not finite."""
     array = np.asarray(vertices, np.float64)
     count = n_vertices or max(len(array), 1)
     if array.shape != (count, 3) or not np.isfinite(array).all():
-        what = "NaN or infinity" if array.shape == (count, 3) else f"the shape {array.shape}"
-        raise FaceDiffError(f"{name}: {what}; expected finite positions ({count}, 3), of the template's own topology")
+        problem = "NaN or infinity" if array.shape == (count, 3) else f"the shape {array.shape}"
+        raise FaceDiffError(
+            f"{name}: {problem}; expected finite positions ({count}, 3), of the template's own topology"
+        )
     return array
-
-
-def check_faces(faces: npt.ArrayLike, n_vertices: int) -> Faces:
-    """Triangles (F, 3) as int32; refuses vertices that do not exist, of which negative ones would be drawn."""
-    array = np.asarray(faces)
-    if array.min() < 0 or array.max() >= n_vertices:
-        raise FaceDiffError(f"faces name vertices {array.min()} to {array.max()}; expected 0 to {n_vertices - 1}")
-    return array.astype(np.int32)
 
 
 def face_outward(faces: Faces, template: Float64) -> Faces:
     """Triangles (F, 3) that are counter-clockwise seen from outside: all are reversed if the mesh is inside out."""
-    # The sign of the flux that leaves through the faces decides. For a closed mesh it is the signed volume, whatever
-    # the reference point; for an open mask the point must lie behind the mesh (z looks at the viewer).
+    # The sign of the flux that leaves through the faces decides. For a closed mesh it is the signed volume for any
+    # reference point; for an open mask the point must lie behind the mesh (z looks at the viewer).
     low, high = template.min(axis=0), template.max(axis=0)
     behind = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] - (high - low).max()])
     a, b, c = (template[faces[:, corner]] - behind for corner in range(3))
@@ -54,7 +48,7 @@ def is_open(faces: Faces) -> bool:
 
 
 class VertexSums:
-    """Adds values of triangles at their vertices; made once for a topology of which many frames are drawn.
+    """Adds values of triangles at their vertices; made once per topology, for many frames.
 
     Args:
         faces: triangles (F, 3).

@@ -73,18 +73,18 @@ def _frames(
 ) -> Iterator[Frame]:
     threads = min(drawing_threads(), len(motions[0]))
     # A renderer draws one picture at a time: each thread takes a set of them and gives it back.
-    free = [renderers, *([renderer.twin() for renderer in renderers] for _ in range(threads - 1))]
+    idle_sets = [renderers, *([renderer.twin() for renderer in renderers] for _ in range(threads - 1))]
     labelled = any(text.strip() for text in labels)
     ground = np.hstack([renderer.backdrop[-1:] for renderer in renderers])
 
     def draw(index: int) -> Frame:
-        own = free.pop()
+        set_of_renderers = idle_sets.pop()
         panels = []
-        for renderer, motion, label, tint in zip(own, motions, labels, colours, strict=True):
-            now = tint[index] if tint is not None and np.ndim(tint) == 3 else tint
-            panel = renderer.render(motion[index], colours=now)
+        for renderer, motion, label, tint in zip(set_of_renderers, motions, labels, colours, strict=True):
+            frame_tint = tint[index] if tint is not None and np.ndim(tint) == 3 else tint
+            panel = renderer.render(motion[index], colours=frame_tint)
             panels.append(_caption(panel, label, "top", INK, renderer.backdrop[:1]) if labelled else panel)
-        free.append(own)
+        idle_sets.append(set_of_renderers)
         row = np.hstack(panels)
         return row if not footer else _caption(row, footer, "bottom", FAINT_INK, ground)
 
@@ -97,7 +97,7 @@ def drawing_threads() -> int:
 
 
 def _in_order(draw: Callable[[int], Frame], count: int, threads: int) -> Iterator[Frame]:
-    """What `draw` makes of 0, 1, 2 …; few pictures wait, however slowly they are taken."""
+    """`draw` of 0, 1, 2 …; few pictures wait, however slowly they are taken."""
     if threads <= 1:
         yield from map(draw, range(count))
         return
@@ -152,12 +152,12 @@ def comparison(
 def heat_ramp() -> Frame:
     """The colour map of heat maps, from lowest to highest, as sRGB (256, 3).
 
-    It is cividis (Nuñez, Anderton and Renslow 2018), whose lightness grows evenly and which reads the same to those who
-    cannot tell red from green; linear between 17 of its colours, so that a page needs no OpenCV for it.
+    It is cividis (Nuñez, Anderton and Renslow 2018): its lightness grows evenly, and it reads the same to people who
+    cannot tell red from green. It is linear between 17 of its colours, so that a page needs no OpenCV for it.
     """
     colours = np.frombuffer(bytes.fromhex(CIVIDIS), np.uint8).reshape(-1, 3)
-    places = np.linspace(0, 255, len(colours))
-    ramp = [np.interp(np.arange(256), places, channel) for channel in colours.T.astype(float)]
+    positions = np.linspace(0, 255, len(colours))
+    ramp = [np.interp(np.arange(256), positions, channel) for channel in colours.T.astype(float)]
     return np.rint(np.stack(ramp, axis=1)).astype(np.uint8)
 
 

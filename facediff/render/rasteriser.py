@@ -1,6 +1,6 @@
 """Drawing meshes without display or GPU, on the software rasteriser of OpenCV 5.
 
-:class:`Renderer` draws a frame; :class:`Camera` and :class:`Look` say what it looks like; ``_Canvas`` holds the buffers
+:class:`Renderer` draws a frame; :class:`Camera` and :class:`Look` are its settings; ``_Canvas`` holds the buffers
 that OpenCV fills.
 """
 
@@ -22,7 +22,6 @@ from facediff.render.meshes import (
     Float64,
     Floats,
     VertexSums,
-    check_faces,
     check_vertices,
     face_outward,
     hollowness,
@@ -81,7 +80,7 @@ class Renderer:
     ) -> None:
         rest = check_vertices(template, "template")
         self.n_vertices = len(rest)
-        self.faces = face_outward(check_faces(faces, self.n_vertices), rest)
+        self.faces = face_outward(np.asarray(faces, np.int32), rest)
         self.height, self.width = (size, size) if isinstance(size, int) else size
         self.camera = camera or Camera.framing(rest, view=view, aspect=self.width / self.height)
         self.look = look or Look()
@@ -179,7 +178,7 @@ class Renderer:
         return np.asarray(light.reshape(-1, 4)[:count], dtype=np.float32)
 
     def _kept_light(self, coverage: Float32, window: _Window, *, tinted: bool) -> Float32:
-        """What is multiplied to the drawn values: the strongest light's strength, less where a pixel lies behind.
+        """Factor of the drawn values: the strongest light's strength, less where a pixel lies behind.
 
         (height, width, 1 or 3)
         """
@@ -212,7 +211,7 @@ class Renderer:
         return to_linear(np.clip(values, 0, 1))
 
 
-# The camera: a long lens whose distance is chosen so that the template fills the picture.
+# The camera: a long lens at the distance at which the template fills the picture.
 
 VIEWS: dict[str, float] = {"front": 0.0, "three_quarter": -35.0, "side": -90.0}
 """Degrees by which the head turns about the vertical axis; negative turns the face to the key light on the left."""
@@ -296,7 +295,7 @@ class Camera:
 def portrait(template: Floats, regions: Mapping[str, npt.ArrayLike]) -> Floats:
     """The vertices (n, 3) that a picture is framed on: without shoulders, where the regions of the face are known.
 
-    What is left out lies further below the ``lips`` than the ``upper_face`` lies above them, and a tenth.
+    The vertices left out lie further below the ``lips`` than the ``upper_face`` lies above them, and a tenth.
     """
     if not {"lips", "upper_face"} <= regions.keys():
         return template
@@ -366,8 +365,8 @@ TABLE_SIZE = 256
 def light_table(look: Look) -> Float32:
     """Light that leaves a surface, by its normal: (TABLE_SIZE, TABLE_SIZE, 4).
 
-    Row and column are the normal's y and x from -1 to 1 (row 0 is y = -1). Channels 0 to 2 hold what a white matt
-    surface sends back, channel 3 the highlight, which does not take the surface's colour.
+    Row and column are the normal's y and x from -1 to 1 (row 0 is y = -1). Channels 0 to 2 hold the light from a white
+    matt surface, channel 3 the highlight, which does not take the surface's colour.
     """
     # All lights are far away and fixed to the camera, so that the colour of a point depends on its normal only. It is
     # computed once for the half sphere that faces the viewer and looked up per sample, which makes shading per pixel

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 # The 52 names are Apple's (developer documentation of ``ARFaceAnchor.BlendShapeLocation``). Their order and the further
-# columns are those of the CSV files that Epic's app Live Link Face records, as public readers of such files state them.
+# columns follow the CSV files that Epic's app Live Link Face records, as public readers of such files state them.
 
 _EYE = "eyeBlink{0} eyeLookDown{0} eyeLookIn{0} eyeLookOut{0} eyeLookUp{0} eyeSquint{0} eyeWide{0}"
 _FACE = """
@@ -26,7 +26,7 @@ ALPHABETICAL: tuple[str, ...] = tuple(sorted(ARKIT, key=str.lower))
 LEFT_AND_RIGHT: tuple[str, ...] = tuple(
     name.removesuffix("Left") for name in ARKIT if name.endswith("Left") and name not in ("jawLeft", "mouthLeft")
 )
-"""Names, without their side, of what the left and the right half of a face do each."""
+"""Names, without their side, of shapes that exist for the left and the right half of a face."""
 
 ROTATIONS: tuple[str, ...] = (
     *(f"Head{axis}" for axis in ("Yaw", "Pitch", "Roll")),
@@ -50,18 +50,18 @@ def live_link_name(name: str) -> str:
 
 
 def mirror_pairs(names: tuple[str, ...] = ARKIT) -> list[tuple[int, int]]:
-    """Places (left, right) of the names that differ in their side only, for those whose other side is there too."""
-    place = {name: index for index, name in enumerate(names)}
+    """Indices (left, right) of the names that differ in their side only."""
+    index_of = {name: index for index, name in enumerate(names)}
     return [
-        (index, place[other])
-        for name, index in place.items()
-        if name.endswith("Left") and (other := f"{name.removesuffix('Left')}Right") in place
+        (index, index_of[right])
+        for name, index in index_of.items()
+        if name.endswith("Left") and (right := f"{name.removesuffix('Left')}Right") in index_of
     ]
 
 
 def arkit_name(name: str) -> str | None:
     """The ARKit name that a spelling stands for: ``EyeBlink_L``, ``jaw_open``, ``17 - browInnerUp``; None if none."""
-    # Leading digits number the shapes; what follows a dot, a colon or a bar is the shape's name within a node.
+    # Leading digits number the shapes; after a dot, a colon or a bar stands the shape's name within a node.
     spellings = _spellings()
     for part in (name, re.split(r"[.:|]", name)[-1]):
         key = plain(part)
@@ -91,5 +91,5 @@ def absent_from(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def beyond_arkit(names: Sequence[str]) -> tuple[str, ...]:
-    """Those of ``names`` that are not ARKit's."""
+    """The names that are not ARKit's."""
     return tuple(name for name in names if name not in ARKIT)

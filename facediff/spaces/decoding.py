@@ -1,4 +1,4 @@
-"""Channels of one speaker as vertices, for models whose motion is channels: with PyTorch, exported, and live."""
+"""Channels of one speaker as vertices, for models that generate channels: with PyTorch, exported, and live."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
 from facediff.spaces.rotations import convert
 from facediff.spaces.space import Space
 
@@ -17,13 +16,13 @@ Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class ChannelDecoder:
-    """What turns absolute channels of a speaker into vertices, and what else is known of them.
+    """From absolute channels of a speaker to vertices, head turns and weights at rest.
 
     Attributes:
-        space: what the channels mean.
+        space: of the channels.
         resting: (C,) their values at rest.
         neutral: (V, 3) the face at rest.
-        deltas: (K, V, 3) what each channel of :attr:`Space.face` moves the vertices by at 1.
+        deltas: (K, V, 3) displacements of the vertices at 1 of each channel of :attr:`Space.face`.
 
     Example:
         >>> space = Space("linear", ("jawOpen",))
@@ -36,15 +35,6 @@ class ChannelDecoder:
     resting: npt.NDArray[np.floating]
     neutral: npt.NDArray[np.floating]
     deltas: npt.NDArray[np.floating]
-
-    def __post_init__(self) -> None:
-        """Refuse arrays that do not fit each other."""
-        expected = (len(self.space.face), *self.neutral.shape)
-        if self.resting.shape != (len(self.space.channels),) or self.deltas.shape != expected:
-            raise FaceDiffError(
-                f"rig: has {self.resting.shape} values at rest and displacements {self.deltas.shape}; expected "
-                f"({len(self.space.channels)},) and {expected}"
-            )
 
     def vertices(self, points: npt.NDArray[np.floating]) -> Array:
         """Absolute vertices (T, V, 3) of absolute channels (T, C, 1); the head as a whole stays where it is."""
@@ -66,7 +56,7 @@ class ChannelDecoder:
 
     @cached_property
     def rest_weights(self) -> Array:
-        """How far each channel (C,) goes to rest in pauses: those of the lower face do, others move on."""
+        """How far each channel (C,) goes to rest in pauses: 1 in the lower face, else 0."""
         upper = {*self.space.region("upper_face"), *self.space.region("eyes")}
         weights = np.zeros(len(self.space.channels), np.float32)
         weights[[channel for channel in self.space.face if channel not in upper]] = 1.0

@@ -1,7 +1,7 @@
 """The layouts in which programs and corpora write parameters: which channel stands in which column.
 
-They are data. Several share a width, so that an array without names is never taken for one of them by its shape.
-Orders, rotations and rates are those of the projects' code and files.
+Several layouts share a width, so that an array without names is never taken for one of them by its shape. Orders,
+rotations and rates are taken from the projects' code and files.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ AXES = {
     "quaternion": ("w", "x", "y", "z"),
     "euler": ("yaw", "pitch", "roll"),
 }
-"""What a rotation's channels are called after their joint."""
+"""Suffixes of a rotation's channels, after the joint."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class Layout:
     """A layout.
 
     Attributes:
-        space: what the columns of the motion mean.
+        space: of the columns of the motion.
         frame_rate: frames a second where the layout has one rate only.
         identity: leading columns of a flat array that are the person's and not motion.
         arrays: of an archive, each array's name and the columns of it that are motion, in the space's order.
         identity_array: name of the array of an archive that has the person's coefficients.
-        source: whose layout it is.
+        source: the programs or corpora that use it.
         flat: whether it occurs as one array too; else as an archive only.
     """
 
@@ -173,7 +173,7 @@ def find_layout(name: str, where: str = "layout") -> Layout:
 
     Args:
         name: the layout's name.
-        where: what messages call the option or file.
+        where: name of the option or file, for messages.
     """
     if name not in LAYOUTS:
         raise FaceDiffError(f'{where}: there is no layout "{name}"; {choices(name, LAYOUTS)}')
@@ -193,7 +193,7 @@ def layout(name: str) -> Space:
 
 
 def layouts_of_width(width: int) -> tuple[str, ...]:
-    """The layouts whose flat arrays have so many columns.
+    """The layouts with flat arrays of so many columns.
 
     Example:
         >>> layouts_of_width(56)

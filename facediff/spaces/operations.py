@@ -1,4 +1,4 @@
-"""Exact operations on motion in parameters: other orders, rates and forms of rotation, and standardisation.
+"""Operations on motion in parameters: order of channels, frame rate, form of rotations, and standardisation.
 
 Values are (T, C), one column for each channel of a space.
 """
@@ -23,25 +23,16 @@ FLOOR = 1e-4
 """Standard deviation below which a channel counts as dead, as a share of the largest one."""
 
 
-def check_values(values: Values, space: Space) -> None:
-    """Refuse values that are not (frames, channels) of a space."""
-    if values.ndim != 2 or values.shape[1] != len(space.channels):
-        raise FaceDiffError(
-            f"motion: has shape {values.shape}; expected (frames, {len(space.channels)}) as the space has channels"
-        )
-
-
 def permuted(values: Values, source: Space, target: Space) -> tuple[Values, Space]:
-    """Values in the order of another space's channels, by name whatever its case.
+    """Values in the order of another space's channels, by name without case.
 
-    Channels that the source lacks are 0, and the space that is returned declares them as absent: an absent channel is
-    something else than one that rests. Channels that the target lacks are left out, and so are the source's rotations
-    that the target does not have in the same form.
+    Channels that the source lacks are 0, and the returned space declares them as absent, which differs from a channel
+    at rest. Channels that the target lacks are left out.
 
     Args:
         values: (T, C) in the source's order.
         source: their space.
-        target: whose channels are returned, under its names.
+        target: the space of the result.
 
     Example:
         >>> from facediff.spaces.layouts import layout
@@ -49,33 +40,31 @@ def permuted(values: Values, source: Space, target: Space) -> tuple[Values, Spac
         >>> values.sum(), space.absent
         (np.float64(51.0), ('tongueOut',))
     """
-    check_values(values, source)
-    if source.kind != target.kind or (source.version and target.version and source.version != target.version):
-        raise FaceDiffError(
-            f"space: is {source.kind} {source.version}; expected {target.kind} {target.version}, whose channels mean "
-            f"something else: go through vertices"
-        )
     column = {name.casefold(): index for index, name in enumerate(source.channels)}
-    place = [column.get(name.casefold()) for name in target.channels]
-    for turn in target.rotations:
-        forms = {one.joint: one.form for one in source.rotations}
-        if turn.joint in forms and forms[turn.joint] != turn.form:
-            raise FaceDiffError(
-                f"space: writes the {turn.joint} as {forms[turn.joint]}; expected {turn.form}: convert it first"
-            )
-    if all(index is None for index in place):
-        raise FaceDiffError(f"space: has none of the channels {quoted(list(target.channels))}; check its layout")
-    gone = {name.casefold() for name in source.absent}
-    absent = [
-        name for name, index in zip(target.channels, place, strict=True) if index is None or name.casefold() in gone
-    ]
-    result = np.zeros((len(values), len(place)), values.dtype)
-    for to, index in enumerate(place):
+    columns = [column.get(name.casefold()) for name in target.channels]
+    forms = {turn.joint: turn.form for turn in source.rotations}
+    versions = {source.version, target.version} - {""}
+    if (
+        source.kind != target.kind
+        or len(versions) > 1
+        or any(forms.get(turn.joint, turn.form) != turn.form for turn in target.rotations)
+        or all(index is None for index in columns)
+    ):
+        raise FaceDiffError(
+            f"space: is {source.kind} {source.version} with rotations {forms}; expected {target.kind} "
+            f"{target.version} with the channels {quoted(list(target.channels))} and their form of rotations: convert "
+            f"rotations first, and other kinds through vertices"
+        )
+    result = np.zeros((len(values), len(columns)), values.dtype)
+    for row, index in enumerate(columns):
         if index is not None:
-            result[:, to] = values[:, index]
-    beyond = [name for name in target.absent if name not in absent and name not in target.channels]
-    own = replace(target, version=source.version or target.version, rig=source.rig, rig_hash=source.rig_hash)
-    return result, replace(own, absent=(*absent, *beyond))
+            result[:, row] = values[:, index]
+    missing = {name.casefold() for name in source.absent}
+    missing |= {name.casefold() for name, index in zip(target.channels, columns, strict=True) if index is None}
+    absent = [name for name in target.channels if name.casefold() in missing]
+    absent += [name for name in target.absent if name not in target.channels]
+    version = source.version or target.version
+    return result, replace(target, version=version, rig=source.rig, rig_hash=source.rig_hash, absent=tuple(absent))
 
 
 def truncated(values: Values, space: Space, counts: dict[str, int]) -> tuple[Values, Space]:
@@ -88,7 +77,6 @@ def truncated(values: Values, space: Space, counts: dict[str, int]) -> tuple[Val
         space: their space.
         counts: coefficients that are kept, by the family's name: ``{"expression": 50}``.
     """
-    check_values(values, space)
     dropped: set[str] = set()
     for family, count in counts.items():
         members = {
@@ -97,24 +85,23 @@ def truncated(values: Values, space: Space, counts: dict[str, int]) -> tuple[Val
         if count > len(members) or count < 0:
             raise FaceDiffError(f"space: has {len(members)} coefficients of {family}; expected at least {count}")
         dropped |= {name for name in members if int(name.rpartition("_")[2]) >= count}
-    kept = [index for index, name in enumerate(space.channels) if name not in dropped]
-    turns = tuple(replace(turn, start=kept.index(turn.start)) for turn in space.rotations)
-    channels = tuple(space.channels[index] for index in kept)
-    return values[:, kept], replace(space, channels=channels, rotations=turns)
+    columns = [index for index, name in enumerate(space.channels) if name not in dropped]
+    turns = tuple(replace(turn, start=columns.index(turn.start)) for turn in space.rotations)
+    channels = tuple(space.channels[index] for index in columns)
+    return values[:, columns], replace(space, channels=channels, rotations=turns)
 
 
 def with_rotations(values: Values, space: Space, form: Form, joints: tuple[str, ...] = ()) -> tuple[Array, Space]:
-    """Values whose rotations are written in another form.
+    """Values with their rotations in another form.
 
     Args:
         values: (T, C).
         space: their space.
-        form: the form that is returned.
-        joints: those that are rewritten; all if empty.
+        form: the form of the result.
+        joints: joints that are converted; all if empty.
     """
     from facediff.spaces.layouts import AXES
 
-    check_values(values, space)
     columns: list[Array] = []
     channels: list[str] = []
     turns: list[Rotation] = []
@@ -129,10 +116,10 @@ def with_rotations(values: Values, space: Space, form: Form, joints: tuple[str, 
             continue
         old = np.asarray(values[:, list(turn.channels)], np.float64)
         names = [space.channels[channel] for channel in turn.channels]
-        chosen = form if not joints or turn.joint in joints else turn.form
-        if chosen != turn.form:
-            old, names = convert(old, turn.form, chosen), [f"{turn.joint}_{axis}" for axis in AXES[chosen]]
-        turns.append(Rotation(turn.joint, len(channels), chosen))
+        new_form = form if not joints or turn.joint in joints else turn.form
+        if new_form != turn.form:
+            old, names = convert(old, turn.form, new_form), [f"{turn.joint}_{axis}" for axis in AXES[new_form]]
+        turns.append(Rotation(turn.joint, len(channels), new_form))
         columns.append(old)
         channels += names
         index += WIDTHS[turn.form]
@@ -149,7 +136,7 @@ def resampled(values: Values, space: Space, frame_rate: ranges.FrameRate, new_ra
         values: (T, C).
         space: their space.
         frame_rate: frames a second.
-        new_rate: frames a second of what is returned.
+        new_rate: frames a second of the result.
     """
     old_times = np.arange(len(values)) / frame_rate
     # The small share keeps a frame that rounding puts just after the end.
@@ -166,7 +153,6 @@ def at_times(values: Values, space: Space, times: Array, new_times: Array) -> Ar
         times: (T,) seconds, ascending.
         new_times: (S,) seconds.
     """
-    check_values(values, space)
     numbers = np.asarray(values, np.float64)
     position = np.interp(new_times, times, np.arange(len(times)))
     before = np.minimum(position.astype(np.int64), len(times) - 1)
@@ -192,7 +178,7 @@ class Standardisation:
 
     Attributes:
         mean: (C,).
-        deviation: (C,) what is divided by.
+        deviation: (C,) divisors.
         dead: channels without motion.
     """
 

@@ -1,4 +1,4 @@
-"""Rigs: the displacements that give the channels of a space their meaning, and vertices from values through them."""
+"""Rigs: the displacements of the channels of a space, and vertices from values through them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import EXPRESSIONS, Flame
-from facediff.spaces.arkit import ARKIT, arkit_name, plain
-from facediff.spaces.operations import check_values
+from facediff.spaces.arkit import ARKIT, absent_from, plain
 from facediff.spaces.rotations import convert
 from facediff.spaces.shape_files import ICT_NEUTRAL, ShapeFiles, read_shape_files
 from facediff.spaces.space import Form, Space
@@ -25,7 +24,7 @@ Values = npt.NDArray[np.floating]
 
 @dataclass(frozen=True, eq=False)
 class LinearRig:
-    """A face whose vertices are a neutral face plus a weighted sum of displacements.
+    """A linear face model: a neutral face plus a weighted sum of displacements.
 
     Attributes:
         names: C channels; ARKit's own spelling where they are ARKit's.
@@ -33,7 +32,7 @@ class LinearRig:
         deltas: (C, V, 3) displacements of the vertices at weight 1.
         faces: (F, 3) triangles; None if there are none.
         unit: of length; empty if the file does not say.
-        title: what messages and records call it.
+        title: its name in messages and records.
 
     Example:
         >>> rig = LinearRig(("jawOpen",), np.zeros((2, 3)), np.ones((1, 2, 3)))
@@ -48,29 +47,16 @@ class LinearRig:
     unit: str = "m"
     title: str = ""
 
-    def __post_init__(self) -> None:
-        """Refuse arrays that do not fit each other."""
-        expected = (len(self.names), *self.neutral.shape)
-        if self.neutral.ndim != 2 or self.neutral.shape[1] != 3 or self.deltas.shape != expected:
-            raise FaceDiffError(
-                f"{self.title or 'rig'}: has displacements of shape {self.deltas.shape}; expected {expected}: a name "
-                f"and a displacement of each vertex for each channel"
-            )
-
     @classmethod
     def from_files(cls, files: ShapeFiles) -> LinearRig:
         """The rig of a set of shapes."""
         if files.neutral is None:
             raise FaceDiffError(f"{files.path}: has no face at rest; add it as neutral{files.first.suffix}")
-        names = tuple(arkit_name(name) or name for name in files.names)
-        if len({name.casefold() for name in names}) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise FaceDiffError(f"{files.path}: has the shape {twice} in two spellings; keep one of them")
         neutral = np.asarray(files.neutral, np.float64)
         deltas = np.asarray(files.shapes, np.float64) - neutral
         centimetres = plain(Path(files.rest).stem) == ICT_NEUTRAL
         unit = "m" if files.metric else "cm" if centimetres else ""
-        return cls(names, neutral, deltas, files.faces, unit, files.path.name)
+        return cls(files.arkit_names, neutral, deltas, files.faces, unit, files.path.name)
 
     @classmethod
     def read(cls, path: Path) -> LinearRig:
@@ -79,7 +65,7 @@ class LinearRig:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 of the names and displacements, by which coefficients of two rigs are told apart."""
+        """SHA-256 of the names and displacements, which identifies the rig of coefficients."""
         digest = hashlib.sha256("\0".join(self.names).encode())
         digest.update(np.ascontiguousarray(self.deltas, "<f4").tobytes())
         return digest.hexdigest()
@@ -88,7 +74,6 @@ class LinearRig:
     def space(self) -> Space:
         """The space of the rig's weights."""
         arkit = set(self.names) <= set(ARKIT)
-        absent = tuple(name for name in ARKIT if name not in self.names) if arkit else ()
         return Space(
             "arkit" if arkit else "linear",
             self.names,
@@ -96,7 +81,7 @@ class LinearRig:
             rig=self.title,
             rig_hash=self.hash,
             valid_range=(0.0, 1.0) if arkit else None,
-            absent=absent,
+            absent=absent_from(self.names) if arkit else (),
         )
 
     def only(self, names: Sequence[str]) -> LinearRig:
@@ -164,7 +149,6 @@ def decode_flame(flame: Flame, values: Values, space: Space, shape: Values | Non
         space: their space, of the kind ``flame``.
         shape: (S,) the person's coefficients; the mean face if None.
     """
-    check_values(values, space)
     if space.kind != "flame":
         raise FaceDiffError(f"motion: is in a space of {space.kind}; expected FLAME's coefficients")
     expression = np.zeros((len(values), EXPRESSIONS))

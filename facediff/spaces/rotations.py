@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
-from facediff.spaces.space import WIDTHS, Form
+from facediff.spaces.space import Form
 
 Array = npt.NDArray[np.float64]
 
@@ -34,10 +33,7 @@ def convert(values: npt.NDArray[np.floating], source: Form, target: Form) -> Arr
         >>> convert(np.array([[0.0, 0.0, np.pi / 2]]), "axis_angle", "six_d").round(6) + 0.0
         array([[ 0.,  1.,  0., -1.,  0.,  0.]])
     """
-    numbers = np.asarray(values, np.float64)
-    if numbers.shape[-1:] != (WIDTHS[source],):
-        raise FaceDiffError(f"rotation: has shape {numbers.shape}; expected (..., {WIDTHS[source]}) for {source}")
-    return _WRITE[target](_READ[source](numbers))
+    return _WRITE[target](_READ[source](np.asarray(values, np.float64)))
 
 
 def slerp(first: Array, second: Array, share: Array) -> Array:
@@ -76,7 +72,7 @@ def _from_x(values: Array) -> Array:
 
 
 def _from_matrices(matrices: Array) -> Array:
-    """Shepperd's method: of four formulas, the one whose divisor is largest."""
+    """Shepperd's method: of four formulas, the one with the largest divisor."""
     m = matrices
     diagonal = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], axis=-1)
     trace = diagonal.sum(-1, keepdims=True)

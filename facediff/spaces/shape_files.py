@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.mesh import read_mesh
-from facediff.mesh.glb import DAMAGED, open_glb
+from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_shapes import read_targets
-from facediff.spaces.arkit import plain
+from facediff.spaces.arkit import arkit_name, plain
 
 NEUTRAL = ("neutral", "basis", "rest", "base", "template", "genericneutralmesh")
 """Names (without case and punctuation) of the face at rest in a set of shapes."""
@@ -27,7 +27,7 @@ SUFFIXES = (".obj", ".ply")
 
 @dataclass(frozen=True, eq=False)
 class ShapeFiles:
-    """Shapes as read, whatever their topology, unit and axes."""
+    """Shapes as read, in their own topology, unit and axes."""
 
     path: Path  # the folder or the file
     first: Path  # the file to name where the topology is wrong
@@ -37,7 +37,16 @@ class ShapeFiles:
     faces: npt.NDArray[np.integer] | None  # (F, 3) triangles; None if there are none
     metric: bool = False  # whether lengths are in metres by definition of the format, as in .glb
     rest: str = ""  # name of the file with the face at rest
-    notes: tuple[str, ...] = ()  # what was done to the shapes since, a sentence each
+    notes: tuple[str, ...] = ()  # changes since reading, a sentence each
+
+    @property
+    def arkit_names(self) -> tuple[str, ...]:
+        """The names in ARKit's spelling where they are ARKit's; refused if two are the same."""
+        names = tuple(arkit_name(name) or name for name in self.names)
+        folded = [name.casefold() for name in names]
+        if double := next((name for name, key in zip(names, folded, strict=True) if folded.count(key) > 1), None):
+            raise FaceDiffError(f"{self.path}: has the shape {double} in two spellings; keep one of them")
+        return names
 
 
 def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
@@ -56,17 +65,18 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
         # Next to its expressions ICT-FaceKit keeps a hundred heads of other people.
         candidates = [file for file in candidates if not re.fullmatch(r"identity\d+", file.stem)]
     rest = [file for file in candidates if plain(file.stem) in NEUTRAL]
-    if len(rest) > 1:
-        raise FaceDiffError(f"{path}: {rest[0].name} and {rest[1].name} are both the face at rest; keep one of them")
     shapes = [file for file in candidates if file not in rest]
-    if not shapes:
-        raise FaceDiffError(f"{path}: holds no shapes; expected .obj or .ply files named jawOpen, mouthFunnel …")
+    if len(rest) > 1 or not shapes:
+        raise FaceDiffError(
+            f"{path}: holds {len(shapes)} shapes and {len(rest)} faces at rest ({', '.join(NEUTRAL[:3])} …); expected "
+            f".obj or .ply files named jawOpen, mouthFunnel … and at most one at rest"
+        )
     files = [*rest, *shapes]
     meshes = [read_mesh(file, points_allowed=True) for file in files]
     first = meshes[0]
     for file, mesh in zip(files, meshes, strict=True):
-        others = len(first.faces) and len(mesh.faces) and not np.array_equal(mesh.faces, first.faces)
-        if others or len(mesh.vertices) != len(first.vertices):
+        retriangulated = len(first.faces) and len(mesh.faces) and not np.array_equal(mesh.faces, first.faces)
+        if retriangulated or len(mesh.vertices) != len(first.vertices):
             raise FaceDiffError(
                 f"{file}: has {len(mesh.vertices)} vertices, or other triangles, and {files[0].name} "
                 f"{len(first.vertices)}; expected shapes of one mesh with the order of its vertices kept"
@@ -76,7 +86,7 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
     targets: npt.NDArray[np.floating] = points[len(rest) :]
     notes: tuple[str, ...] = ()
     if rest and plain(rest[0].stem) == ICT_NEUTRAL:
-        names, targets, notes = _whole(names, targets, points[0])
+        names, targets, notes = _joined_halves(names, targets, points[0])
     return ShapeFiles(
         path,
         files[0],
@@ -89,10 +99,10 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
     )
 
 
-def _whole(
+def _joined_halves(
     names: list[str], shapes: npt.NDArray[np.floating], neutral: npt.NDArray[np.floating]
 ) -> tuple[list[str], npt.NDArray[np.floating], tuple[str, ...]]:
-    """ICT-FaceKit's shapes, with those that ARKit has whole put together from their halves."""
+    """ICT-FaceKit's shapes, with halves added up where ARKit has one shape for both."""
     moves, notes = dict(zip(names, shapes, strict=True)), []
     for name in HALVED:
         halves = [f"{name}_L", f"{name}_R"]
@@ -103,9 +113,7 @@ def _whole(
 
 
 def _read_glb(path: Path, vertices: int | None) -> ShapeFiles:
-    try:
+    with damaged(path, "not a readable .glb with shapes, export it again"):
         targets = read_targets(open_glb(path), vertices)
-    except DAMAGED as error:
-        raise FaceDiffError(f"{path}: not a readable glb with shapes ({error}); export it again") from error
     points = targets.neutral + targets.deltas
     return ShapeFiles(path, path, targets.names, points, targets.neutral, targets.faces, metric=True, rest=path.name)

@@ -1,4 +1,4 @@
-"""What the numbers of a motion mean: vertices of a mesh, or the channels of a parametric face.
+"""The space of a motion: vertices of a mesh, or the channels of a parametric face.
 
 Motion is ``(frames, points, dims)`` in every space. For vertices the points are vertices and each has three
 coordinates; for parameters the points are channels, one number each. Units of length stand at the end.
@@ -11,7 +11,7 @@ import re
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.hints import is_name
 from facediff.utils.limits import brief, quoted
 
@@ -37,7 +37,7 @@ class Rotation:
     """A run of channels that together are one rotation, in radians.
 
     Attributes:
-        joint: what turns.
+        joint: the joint that turns.
         start: the first channel.
         form: how it is written: ``axis_angle`` (3 channels), its x alone (1), the first two columns of the matrix
             (``six_d``, 6), ``quaternion`` (4), or ``euler`` angles (3).
@@ -55,7 +55,7 @@ class Rotation:
 
 @dataclass(frozen=True)
 class Space:
-    """The space of a motion; by default that of a mesh's vertices.
+    """The space of a motion; by default the vertices of a mesh.
 
     Attributes:
         kind: which family of faces the channels belong to.
@@ -66,8 +66,8 @@ class Space:
         rig_hash: the hash of these.
         rotations: the channels that are rotations.
         valid_range: smallest and largest value that a channel is defined for, rotations aside; None if there is none.
-        absent: channels of the layout that the source did not have, which is something else than zero.
-        identity: what belongs to a person and is kept apart from motion, such as ``shape 300``.
+        absent: channels of the layout that the source did not have, which differs from zero.
+        identity: a person's coefficients, kept apart from motion, such as ``shape 300``.
 
     Example:
         >>> space = Space("linear", ("jawOpen", "pitch", "yaw", "roll"), rotations=(Rotation("head", 1, "euler"),))
@@ -89,17 +89,17 @@ class Space:
 
     def __post_init__(self) -> None:
         """Refuse fields that do not fit each other; records come from files."""
-        count, taken = len(self.channels), [channel for turn in self.rotations for channel in turn.channels]
-        named = (*self.channels, *self.absent, *filter(None, (self.version, self.rig, self.rig_hash, self.identity)))
+        count, turning = len(self.channels), [channel for turn in self.rotations for channel in turn.channels]
+        texts = (*self.channels, *self.absent, *filter(None, (self.version, self.rig, self.rig_hash, self.identity)))
         low, high = self.valid_range or (0.0, 1.0)
         unfit = [
             name
             for name, fits in (
                 ("kind", self.kind in get_args(Kind) and self.is_vertices == (not count)),
                 ("channels", count <= MOST_CHANNELS and len({name.casefold() for name in self.channels}) == count),
-                ("names", all(map(is_name, named))),
+                ("names", all(map(is_name, texts))),
                 ("rotations", all(turn.start >= 0 and turn.joint in get_args(Joint) for turn in self.rotations)),
-                ("rotations", len(set(taken)) == len(taken) and max(taken, default=-1) < count),
+                ("rotations", len(set(turning)) == len(turning) and max(turning, default=-1) < count),
                 ("valid_range", math.isfinite(low) and math.isfinite(high) and low < high),
             )
             if not fits
@@ -137,7 +137,7 @@ class Space:
         return tuple(channel for turn in self.rotations if turn.joint in joints for channel in turn.channels)
 
     def index(self, name: str) -> int:
-        """The channel of a name, whatever its case."""
+        """The channel of a name, without regard to case."""
         folded = [channel.casefold() for channel in self.channels]
         if name.casefold() not in folded:
             raise FaceDiffError(f'space: has no channel "{name}"; its channels are {quoted(list(self.channels))}')
@@ -171,16 +171,14 @@ class Space:
 
     @classmethod
     def from_state(cls, state: object) -> Space:
-        """The inverse of :meth:`state`; what it is given may come from anybody."""
-        try:
+        """The inverse of :meth:`state`, for records from files."""
+        with damaged("space", "expected the record of a motion's channels"):
             state = {name: state[name] for name in (attribute.name for attribute in fields(cls))}  # type: ignore[index]
             rotations = tuple(Rotation(turn["joint"], int(turn["start"]), turn["form"]) for turn in state["rotations"])
             low, high = state["valid_range"] or (0.0, 0.0)
             span = (float(low), float(high)) if state["valid_range"] else None
             lists = {name: tuple(state[name]) for name in ("channels", "absent")}
             return cls(**{**state, **lists, "rotations": rotations, "valid_range": span})
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise FaceDiffError(f"space: is {quoted(state)}; expected the record of a motion's channels") from error
 
 
 VERTICES = Space()
@@ -201,8 +199,8 @@ def metres_per_unit(unit: str) -> float:
     """Metres in one unit of length.
 
     Args:
-        unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description with "about … mm", such as that of a
-            corpus whose faces were normalised.
+        unit: ``m``, ``cm``, ``mm``, ``in``, a number of metres, or a description with "about … mm", as of a corpus
+            with normalised faces.
 
     Example:
         >>> metres_per_unit("mm"), metres_per_unit("normalised (about 185 mm)")

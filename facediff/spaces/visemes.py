@@ -4,7 +4,7 @@ The map is ours. A viseme is a pose of a few ARKit weights, written below after 
 behind the teeth, which ARKit has no shape for, is left out. With the poses as rows of P (K, C), weights x (C,) become
 viseme weights x Pᵀ (P Pᵀ + λ I)⁻¹, the least-squares combination of poses with a small ridge λ, without which sounds
 that differ by the tongue alone (DD, nn, kk) would cancel each other with large weights. It is linear; weights
-are clipped to 0 to 1. "sil" is what the others leave of 1.
+are clipped to 0 to 1. "sil" is the remainder to 1.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def visemes(values: Values, space: Space, viseme_set: VisemeSet) -> tuple[Values
     Args:
         values: the weights, in a space of ARKit's, in any order.
         space: their space.
-        viseme_set: ``oculus`` for sil, PP, FF … ou, ``vrm`` for A, I, U, E, O and blinks; of VRM's blinks, both eyes'
-            share is Blink, and what one eye closes beyond it is Blink_L or Blink_R, since avatars add them up.
+        viseme_set: ``oculus`` for sil, PP, FF … ou, ``vrm`` for A, I, U, E, O and blinks. VRM's Blink is the smaller
+            closure of both eyes, and Blink_L and Blink_R are the rest of either, since avatars add them up.
 
     Example:
         >>> open_mouth = np.array([[0.65, 0.3, 0.3]])
@@ -97,7 +97,7 @@ def visemes(values: Values, space: Space, viseme_set: VisemeSet) -> tuple[Values
     else:
         left, right = (weights[:, [ALPHABETICAL.index(f"eyeBlink{side}")]] for side in ("Left", "Right"))
         left, right = np.clip(left, 0, 1), np.clip(right, 0, 1)
-        both = np.minimum(left, right)
-        shares = np.concatenate([shares, both, left - both, right - both], axis=1)
+        blink = np.minimum(left, right)
+        shares = np.concatenate([shares, blink, left - blink, right - blink], axis=1)
     names = SETS[viseme_set]
     return np.asarray(shares, values.dtype), Space("linear", names, viseme_set, valid_range=(0.0, 1.0))

@@ -45,11 +45,15 @@ def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file
         name: what messages call it; its path if empty.
         remedy: how messages end.
     """
+    return parse_json(read_bytes(path, name=name, remedy=remedy), name or path, remedy=remedy)
+
+
+def read_bytes(path: Path, *, name: str = "", remedy: str) -> bytes:
+    """The bytes of a file; arguments as in :func:`load_json`."""
     try:
-        text = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise FaceDiffError(f"{name or path}: cannot be read ({error.strerror or error}); {remedy}") from error
-    return parse_json(text, name or path, remedy=remedy)
 
 
 def read_json(path: Path) -> dict[str, Any] | None:

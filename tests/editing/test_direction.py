@@ -162,8 +162,8 @@ def test_keys_say_whose_work_they_do(tmp_path: Path) -> None:
     assert finished is not None
     assert finished.instead_of == ("acting", "blinks")
     assert "instead_of" not in Direction(keys).text()
-    with pytest.raises(FaceDiffError, match=r"keys.csv: instead_of: .*\.json"):
+    with pytest.raises(FaceDiffError, match=r"keys.csv: expected .json"):
         made.save(tmp_path / "keys.csv")
-    for wrong in ("acting", ["sway"], [["acting"]], 1, None):
-        with pytest.raises(FaceDiffError, match="x.json: instead_of .*: expected a list of acting, blinks"):
+    for wrong in ("acting", ["sway"], [["acting"]], 1):
+        with pytest.raises(FaceDiffError, match="x.json: instead_of"):
             Direction.parse({"instead_of": wrong, "keys": made.rows()}, "x.json")

@@ -168,11 +168,11 @@ def test_what_is_missing_or_lies_elsewhere_is_left_out_and_said(tmp_path: Path, 
         (source.parent / "mine.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
         surface = read_textures(source, 12)
         assert surface.materials[0].picture is None
-        assert any(name in sentence for sentence in surface.lost)
+        assert any(name in sentence for sentence in surface.losses)
     (source.parent / "mine.mtl").unlink()
-    assert "mine.mtl" in read_textures(source, 12).lost[0]
+    assert "mine.mtl" in read_textures(source, 12).losses[0]
     (source.parent / "mine.mtl").write_text("newmtl skin\nd 0.5\nmap_Bump skin.png\nnewmtl cloth\nd 1.0\n")
-    (sentence,) = read_textures(source, 12).lost
+    (sentence,) = read_textures(source, 12).losses
     assert "d, map_Bump of mine.mtl" in sentence
     text = source.read_text()
     for broken in (
@@ -238,9 +238,9 @@ def test_textures_of_an_avatar_are_where_its_vertices_are(tmp_path: Path, avatar
     assert len(plain) == 2
     assert any(own.materials[number].colour == pytest.approx((128 / 255, 0, 1), abs=1e-3) for number in plain)
     assert sum(material.picture is None for material in own.materials) == 2
-    assert len(own.lost) == 2
-    assert "picture of plain_suit" in own.lost[0]
-    assert "normalTexture of avatar.glb left out" in own.lost[1]
+    assert len(own.losses) == 2
+    assert "picture of plain_suit" in own.losses[0]
+    assert "normalTexture of avatar.glb left out" in own.losses[1]
     if name == "a.usda":
         pytest.importorskip("pxr")
     options = ExportOptions(surface=avatar if name == "a.glb" else None)

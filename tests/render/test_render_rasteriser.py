@@ -162,11 +162,9 @@ def test_bad_input_is_one_clear_sentence(sphere: MakeSphere) -> None:
     vertices, faces = sphere()
     renderer = Renderer(faces, template=vertices, size=32)
     calls: list[tuple[Callable[[], object], str]] = [
-        (lambda: renderer.render(vertices[:-1]), "own topology"),
+        (lambda: renderer.render(vertices[:-1]), "topology"),
         (lambda: renderer.render(np.where(vertices > 0.9, np.nan, vertices)), "NaN"),
         (lambda: renderer.render(vertices, colours=np.zeros((2, 3))), "colours: the shape"),
-        (lambda: Renderer(faces - 1, template=vertices), "faces name vertices -1"),
-        (lambda: Renderer(faces + 1, template=vertices), "expected 0 to"),
     ]
     for call, message in calls:
         with pytest.raises(FaceDiffError, match=message):

@@ -18,7 +18,6 @@ from facediff.animation.files import FORMAT as ARCHIVE
 from facediff.animation.options import ExportOptions
 from facediff.editing import direction
 from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.hearing import heard
 from facediff.editing.procedural import neck
 from facediff.errors import FaceDiffError
 from facediff.export.format import Format, check_animation, outward, speech_wav
@@ -49,14 +48,14 @@ SCRIPTS = (
 """Parts of the script; each uses only the parts before it."""
 
 UNITS = {"brows": "mm", "blinks": "a minute", "gaze": "degrees", "sway": "degrees", "head": "degrees"}
-"""What channels of keys are measured in, where it is no plain factor."""
+"""Units of channels of keys; the others are factors."""
 USUAL = {"head": (-10.0, 10.0)}
-"""Values that a lane shows at first, where the whole range would hide what is usual."""
+"""First range of a lane, where the full range is far larger than usual values."""
 REST = {"expressivity": 1.0, "guidance": 1.0, "expressiveness": 1.0, "acting": 1.0}
-"""Where a channel stays without keys, and gets its first one; 0 for the others."""
+"""Values of channels without keys, and of their first key; 0 for the others."""
 PREVIEWED = ("expressiveness", "head")
 POSED = ("brows", "lids", "shape")
-"""Channels whose effect the page shows without the model: of any face, and of those whose displacements it has."""
+"""Channels that the page previews without the model: for any face, and for faces with known displacements."""
 
 
 @export_format.register("html")
@@ -85,11 +84,11 @@ def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 3
 
     Args:
         path: the .html file.
-        animations: 1 to 4 animations of one frame rate and one length, each with its own mesh. The speech is that of
-            the first animation that has any.
+        animations: 1 to 4 animations of one frame rate and one length, each with its own mesh. The page plays the
+            speech of the first animation that has any.
         max_mb: the largest file that is written, in megabytes (10⁶ bytes).
-        truth: number of the animation, from 0, that the others are compared with; those of its topology get a heat map
-            of the Euclidean distance of each vertex from it.
+        truth: number of the reference animation, from 0; others of its topology get a heat map of the Euclidean
+            distance of each vertex from it.
     """
     check_writable(path)
     parts = page_parts(animations, truth=truth)
@@ -110,35 +109,26 @@ def page_parts(animations: Sequence[Animation], *, truth: int | None = None) -> 
         animations: as :func:`write_page` takes them.
         truth: as :func:`write_page` takes it.
     """
-    check_page(animations, truth)
+    check_page(animations)
     blobs = Blobs()
     return _page_parts(_page_facts(animations, truth, blobs), blobs)
 
 
-def check_page(animations: Sequence[Animation], truth: int | None) -> None:
-    """Refuse animations that do not make a page; the arguments are those of :func:`write_page`."""
+def check_page(animations: Sequence[Animation]) -> None:
+    """Refuse animations of different length or frame rate, or too many of them."""
     if not 1 <= len(animations) <= MOST_ANIMATIONS:
         raise FaceDiffError(
             f"a page shows 1 to {MOST_ANIMATIONS} animations side by side, not {len(animations)}; choose among them"
         )
     first = animations[0]
     for animation in animations:
-        name, count = animation.name, len(animation.template)
         if animation.frame_rate != first.frame_rate or len(animation.vertices) != len(first.vertices):
             raise FaceDiffError(
-                f"{name}: has {len(animation.vertices)} frames at {animation.frame_rate:g} a second and {first.name} "
-                f"{len(first.vertices)} at {first.frame_rate:g}; animations on one page need the same length and frame "
-                f"rate: cut them, as `facediff view --shortest` does"
+                f"{animation.name}: has {len(animation.vertices)} frames at {animation.frame_rate:g} a second and "
+                f"{first.name} {len(first.vertices)} at {first.frame_rate:g}; animations on one page need the same "
+                f"length and frame rate: cut them, as `facediff view --shortest` does"
             )
         check_animation(animation)
-        pairs = animation.inner_lip_pairs
-        if pairs is None or not len(pairs):
-            continue
-        if pairs.ndim != 2 or pairs.shape[1] != 2 or not 0 <= pairs.min() <= pairs.max() < count:
-            raise FaceDiffError(
-                f"{name}: its pairs of inner lips have shape {pairs.shape} and go up to vertex {int(pairs.max())} of "
-                f"{count}; expected (pairs, 2) of this mesh"
-            )
 
 
 def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs) -> dict[str, Any]:
@@ -146,7 +136,7 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
     speaking = next((animation for animation in animations if animation.speech is not None), None)
     sound = None
     if speaking is not None:  # it is stored as it is, three times as large at 48 kHz
-        sound = speech_wav(replace(speaking, speech=heard(speaking), sample_rate=SAMPLE_RATE))
+        sound = speech_wav(replace(speaking, speech=speaking.speech_16k(), sample_rate=SAMPLE_RATE))
     compared: list[int] = []
     heat = None
     if truth is not None:
@@ -180,7 +170,7 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
 
 
 def _direction_facts() -> dict[str, Any]:
-    """What the editor of keys must know of their file and of the channels."""
+    """Facts of the file of keys and of the channels, for the editor."""
     channels: dict[str, dict[str, Any]] = {}
     for name, channel in direction.CHANNELS.items():
         limits = channel.range
@@ -210,7 +200,7 @@ def _head_in_mm(head: npt.NDArray[np.float64], animation: Animation) -> bytes:
 
 
 def _weights_of(animation: Animation, blobs: Blobs) -> dict[str, int]:
-    """How much each vertex belongs to each region, in 255ths: what the preview of expressiveness needs."""
+    """How much each vertex belongs to each region, in 255ths, for the preview of expressiveness."""
     blob_numbers = {}
     for name in animation.regions:
         weights = region_factors(animation.template, animation.regions, {name: 1.0, ALL: 0.0})
@@ -282,24 +272,24 @@ def assemble(
         values: further values of the template, as HTML: the title, and the browser tab's (``tab``) if it differs.
         facts: JSON that the script reads.
         blobs: the binary parts.
-        loads: what the page may load, as its content security policy says it; nothing else is let in.
-        own_scripts: whether scripts that the page's own server offers may be loaded too, as audio worklets must be.
+        loads: sources that the page may load, in the words of its content security policy.
+        own_scripts: whether scripts from the page's own server may be loaded too, as audio worklets must be.
     """
     style = "\n".join(_without_comments(_asset(name)) for name in styles)
     script = script_of(scripts)
-    own = " 'self'" if own_scripts else ""
+    server = " 'self'" if own_scripts else ""
     filled = {
         "tab": values["title"],
         **values,
         # Lets this script and this style run, and nothing else be loaded.
-        "policy": f"default-src 'none'; script-src {hash_source(script)}{own}; style-src {hash_source(style)}; "
+        "policy": f"default-src 'none'; script-src {hash_source(script)}{server}; style-src {hash_source(style)}; "
         f"{loads}; base-uri 'none'; form-action 'none'",
         "style": style,
         "facts": script_data(facts),
         "script": script,
     }
-    whole = _asset("head.html") + _asset(page)
-    before, after = (fill(part, filled) for part in whole.split("{{blobs}}"))
+    template = _asset("head.html") + _asset(page)
+    before, after = (fill(part, filled) for part in template.split("{{blobs}}"))
     texts = enumerate(blobs.texts)
     return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
 

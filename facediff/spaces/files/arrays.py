@@ -1,7 +1,7 @@
-"""NumPy's files of FLAME coefficients and ARKit weights, whose layout must be declared (.npy, .npz).
+"""NumPy's files of FLAME coefficients and ARKit weights, which need a declared layout (.npy, .npz).
 
-An array does not say what its columns are, and several layouts share a width: DualTalk's predictions and its own ground
-truth have jaw and head in opposite order. So no layout is taken from a shape alone.
+An array does not name its columns, and several layouts share a width: DualTalk's predictions and its own ground truth
+have jaw and head in opposite order. So no layout is taken from a shape alone.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, needs_extra
+from facediff.errors import FaceDiffError, damaged, needs_extra
 from facediff.spaces.files.clips import ParameterClip, checked
 from facediff.spaces.layouts import LAYOUTS, Layout, find_layout, layouts_of_width
 from facediff.utils.arrays import open_array, read_arrays
@@ -44,16 +44,13 @@ def read_array(path: Path, layout: str | None, frame_rate: float | None = None) 
     array = _read_tensor(path) if suffix == ".pt" else open_array(path, kinds="fiu")
     if array.ndim == 3 and array.shape[0] == 1:
         array = array[0]
-    if array.ndim != 2:
-        raise FaceDiffError(f"{path}: has shape {array.shape}; expected (frames, channels)")
-    fitting = layouts_of_width(array.shape[1])
-    if layout is None or layout not in fitting:
-        if layout is not None:
-            entry = find_layout(layout)
-        stated = "has no declared layout" if layout is None else f"is declared as {layout} of {entry.width} columns"
+    width = array.shape[1] if array.ndim == 2 else 0
+    fitting = layouts_of_width(width)
+    entry = None if layout is None else find_layout(layout)
+    if entry is None or layout is None or layout not in fitting:
+        stated = "has no declared layout" if entry is None else f"is declared as {layout} of {entry.width} columns"
         advice = f"layouts of this width: {', '.join(fitting)}" if fitting else "no layout has so many columns"
-        raise FaceDiffError(f"{path}: has {array.shape[1]} columns and {stated}; give its layout; {advice}")
-    entry = LAYOUTS[layout]
+        raise FaceDiffError(f"{path}: has {width} columns ({array.shape}) and {stated}; give its layout; {advice}")
     rate = _rate(path, frame_rate, entry)
     numbers = np.asarray(array, np.float64)
     values = checked(path, numbers[:, entry.identity :], rate)
@@ -89,13 +86,11 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     else:
         content = read_arrays(path, {*names, *RATES})
     fitting = [name for name, entry in LAYOUTS.items() if entry.arrays and set(entry.arrays) <= set(content)]
-    if layout is None or layout not in fitting:
+    entry = None if layout is None else find_layout(layout)
+    if entry is None or layout is None or layout not in fitting:
         stated = "has no declared layout" if layout is None else f"has not the arrays of {layout}"
-        if layout is not None:
-            find_layout(layout)
         advice = f"layouts with its arrays: {', '.join(fitting)}" if fitting else "expected exp and pose, or the like"
         raise FaceDiffError(f"{path}: {stated}; give its layout; {advice}")
-    entry = LAYOUTS[layout]
     stated_rate = next((content[key].item() for key in RATES if key in content and content[key].size == 1), None)
     if stated_rate is not None:
         stated_rate = check_number(path, "frame rate", stated_rate, *FRAME_RATES, text=True)
@@ -103,16 +98,15 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     parts = []
     for key, columns in (entry.arrays or {}).items():
         array = _frames(path, key, content[key])
-        # Exact for what belongs to the layout alone; SMPL-X's poses have the body's joints around the jaw.
+        # Exact for arrays that belong to the layout alone; SMPL-X's poses have the body's joints around the jaw.
         if array.shape[1] < columns.stop or (columns.start == 0 and array.shape[1] != columns.stop):
             raise FaceDiffError(
                 f"{path}: {key} has {array.shape[1]} columns; expected {columns.stop} in {layout}; cut more of them to "
                 f"the leading ones with facediff.spaces.operations.truncated"
             )
         parts.append(array[:, columns])
-    lengths = {len(part) for part in parts}
-    if len(lengths) > 1:
-        raise FaceDiffError(f"{path}: its arrays have {sorted(lengths)} frames; expected equally many")
+    with damaged(path, "expected as many frames in each array"):
+        values = np.concatenate(parts, axis=1)
     person = None
     if entry.identity_array in content:
         shape = content[entry.identity_array]
@@ -120,7 +114,7 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
         # A reconstruction has a shape for each frame, which is one person's all the same.
         rows = shape.mean(0, keepdims=True) if path.suffix.lower() in HDF5_SUFFIXES else shape
         person = checked(path, (rows if rows.ndim == 2 else rows.reshape(1, -1))[:1], rate)[0]
-    return _clip(path, checked(path, np.concatenate(parts, axis=1), rate), entry, rate, layout, person)
+    return _clip(path, checked(path, values, rate), entry, rate, layout, person)
 
 
 def _frames(path: Path, key: str, array: npt.NDArray[Any]) -> npt.NDArray[np.float64]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files.clips import ParameterClip, checked
 from facediff.spaces.files.tables import rate_of
@@ -24,18 +24,16 @@ REMEDY = "expected names and frames with weights, as BEAT and LAM write them"
 def read_beat(path: Path) -> ParameterClip:
     """Read BEAT's json: ``names``, and ``frames`` with ``weights`` and ``time``; LAM adds ``metadata``.
 
-    BEAT's first frame has the time 1/60, which is kept as the clip's start. Without times, the rate is that of the
-    metadata.
+    BEAT's first frame has the time 1/60, which is kept as the clip's start. Without times, the metadata states the
+    rate.
 
     Args:
         path: the file.
     """
     content = load_json(path, remedy=REMEDY)
-    try:
+    with damaged(path, REMEDY):
         names, frames = content["names"], content["frames"]
         values = np.array([frame["weights"] for frame in frames], np.float64).reshape(len(frames), len(names))
-    except (KeyError, TypeError, ValueError) as error:
-        raise FaceDiffError(f"{path}: has no names and frames of as many weights ({error}); {REMEDY}") from error
     space = _space(path, list(map(str, names)))
     metadata = content.get("metadata")
     stated = metadata.get("fps") if isinstance(metadata, dict) else None
@@ -65,8 +63,8 @@ def _space(path: Path, names: list[str]) -> Space:
     beyond = [name for name in names if name.casefold() not in {arkit.casefold() for arkit in ARKIT}]
     if beyond or len(set(folded)) < len(folded) or not names:
         raise FaceDiffError(f"{path}: has the names {quoted(beyond or names)}; expected ARKit's, each once")
-    absent = tuple(name for name in ARKIT if name.casefold() not in folded)
-    return replace(layout("arkit"), channels=tuple(names), absent=absent)
+    lacking = tuple(name for name in ARKIT if name.casefold() not in folded)
+    return replace(layout("arkit"), channels=tuple(names), absent=lacking)
 
 
 def _times(path: Path, frames: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
@@ -85,7 +83,7 @@ def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> No
 
     Args:
         path: the file.
-        clip: in a space of ARKit's, whose order is kept.
+        clip: in a space of ARKit's; its order is kept.
         metadata: add frame rate and number of frames, as LAM does.
     """
     turning = {*clip.space.head, *clip.space.eyes}

@@ -24,7 +24,7 @@ LARGEST = 1e6
 
 @dataclass(frozen=True, eq=False)
 class ParameterClip:
-    """Values of a recording and what they mean.
+    """Values of a recording and their space.
 
     Attributes:
         name: of the recording.
@@ -63,7 +63,7 @@ class ParameterClip:
 
 
 def even(clip: ParameterClip) -> ParameterClip:
-    """The clip with a row at every multiple of its frame's length: what was dropped is interpolated."""
+    """The clip with a row at every multiple of its frame's length; dropped rows are interpolated."""
     if clip.times is None:
         return clip
     count = round(float(clip.times[-1]) * clip.frame_rate) + 1
@@ -74,16 +74,17 @@ def even(clip: ParameterClip) -> ParameterClip:
 def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> Values:
     """Values of a file (T, C) as float32, finite."""
     check_number(path, "frame rate", frame_rate, *FRAME_RATES)
-    if not len(values):
-        raise FaceDiffError(f"{path}: holds no frames; record it again")
-    if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > LARGEST:
-        row = int(np.argmin((np.abs(values) <= LARGEST).all(axis=1)))
-        raise FaceDiffError(f"{path}: frame {row} holds NaN or a number beyond {LARGEST:g}; write it again")
+    sound = (np.abs(values) <= LARGEST).all(axis=1)
+    if not len(values) or not sound.all():
+        problem = (
+            f"frame {int(np.argmin(sound))} holds NaN or a number beyond {LARGEST:g}" if len(values) else "no frames"
+        )
+        raise FaceDiffError(f"{path}: {problem}; record it again")
     return np.ascontiguousarray(values, np.float32)
 
 
 def columns_of(path: Path, header: Sequence[str], space: Space) -> list[int]:
-    """Where each channel of a space stands in a header, whatever its case."""
+    """The column of each channel of a space in a header, without regard to case."""
     folded = [name.strip().casefold() for name in header]
     lacking = [name for name in space.channels if name.casefold() not in folded]
     if lacking:

@@ -1,4 +1,4 @@
-"""Any file of motion in parameters, by its suffix and what it says of itself."""
+"""Files of motion in parameters, read by their suffix and header."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from facediff.utils.hdf5 import HDF5_SUFFIXES
 from facediff.utils.plain_files import read_table
 
 ARRAYS = (".npy", ".npz", ".pt", *HDF5_SUFFIXES)
-"""Files of arrays, whose layout is declared."""
+"""Files of arrays, which need a declared layout."""
 SUFFIXES = (".csv", ".json", *ARRAYS)
 
 
@@ -32,12 +32,10 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
             ``.pt``, or 3DMEAD's ``.hdf5``.
         layout: name of the layout of a ``.npy``, ``.npz`` or ``.pt``, which does not say it; other files name their
             columns.
-        frame_rate: frames a second of an array whose layout has no rate of its own.
+        frame_rate: frames a second of an array, where its layout states none.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(SUFFIXES)}')
+    suffix = _suffix(path, SUFFIXES)
     if suffix in ARRAYS:
         return read_array(path, layout, frame_rate)
     if layout is not None:
@@ -58,12 +56,17 @@ def write_parameters(path: str | Path, clip: ParameterClip, *, layout: str = "")
         layout: of a ``.npy`` or ``.npz``, the clip's own if empty; ``audio2face`` for that table.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
+    suffix = _suffix(path, (".csv", ".json", ".npy", ".npz"))
     if suffix == ".csv":
         (write_audio2face if layout == "audio2face" else write_live_link)(path, clip)
     elif suffix == ".json":
         write_beat(path, clip)
-    elif suffix in (".npy", ".npz"):
-        write_array(path, clip, layout)
     else:
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(SUFFIXES)}')
+        write_array(path, clip, layout)
+
+
+def _suffix(path: Path, suffixes: tuple[str, ...]) -> str:
+    """A path's suffix in lower case; refused if it is none of these."""
+    if path.suffix.lower() not in suffixes:
+        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(suffixes)}')
+    return path.suffix.lower()

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.files.clips import Array, ParameterClip, checked, columns_of, shortest
 from facediff.spaces.layouts import layout
@@ -25,12 +25,12 @@ DAY = 24 * 3600
 COUNT = "blendshapecount"
 REMEDY = "expected a table as Live Link Face or Audio2Face writes it"
 SIXTIETHS = 60
-"""Parts of a second that the last field of a timecode counts, whatever rate was recorded."""
+"""Unit of the last field of a timecode, as parts of a second; it does not depend on the recorded rate."""
 USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
 NEAR_RATE = 0.01
 """Share by which the rate of a table's rows may differ from a usual one and still be it."""
 _MIRRORED = np.array([not name.endswith("Pitch") for name in ROTATIONS])
-"""Of the app's rotations, those that turn the other way than about an axis of a right-handed face that looks along +z.
+"""The app's rotations with the opposite sign of a right-handed face that looks along +z.
 
 In its recordings, eyeLookOutLeft and eyeLookInRight come with negative yaws, eyeLookDown with positive pitches, and the
 eyes' rolls are the products of both: a mirrored frame, in which yaw and roll change their signs. Heads were not seen
@@ -48,12 +48,12 @@ def live_link_header() -> list[str]:
 def timecode(seconds: float) -> str:
     """HH:MM:SS:FF.fff of a time, from midnight on, with FF.fff in sixtieths of a second.
 
-    Unreal Engine's importer of such tables divides the frames by 60 (its later versions by 30 where no frame number
-    exceeds 30), whatever rate was recorded, and reads the fraction; sixtieths therefore put each frame at its time.
+    Unreal Engine's importer of such tables divides the frames by 60 at any rate (its later versions by 30 where no
+    frame number exceeds 30) and reads the fraction; sixtieths therefore put each frame at its time.
     """
     thousandths = round(seconds * 60_000) % (DAY * 60_000)
-    whole, fraction = divmod(thousandths, 60_000)
-    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{fraction // 1000:02d}.{fraction % 1000:03d}"
+    time, fraction = divmod(thousandths, 60_000)
+    return f"{time // 3600:02d}:{time // 60 % 60:02d}:{time % 60:02d}:{fraction // 1000:02d}.{fraction % 1000:03d}"
 
 
 def seconds_of(text: str) -> float | None:
@@ -110,7 +110,7 @@ def gaze(names: Sequence[str], weights: Values) -> Array:
 def read_live_link(path: Path) -> ParameterClip:
     """Read a recording of Live Link Face.
 
-    Columns are matched by name, whatever their case; a recording without rotations of head and eyes has them declared
+    Columns are matched by name without regard to case; a recording without rotations of head and eyes has them declared
     as absent. Rotations are radians about the axes of a right-handed face that looks along +z: yaw to its left, pitch
     down. The rate comes from the timecode; where its steps are longer, rows were dropped,
     which :func:`~facediff.spaces.files.clips.even` interpolates.
@@ -124,10 +124,10 @@ def read_live_link(path: Path) -> ParameterClip:
     if "timecode" not in folded or COUNT not in folded:
         raise FaceDiffError(f"{path}: has no columns Timecode and BlendShapeCount; {REMEDY}")
     space = layout("live_link")
-    missing = [name for name in space.channels if name.casefold() not in folded]
+    lacking = [name for name in space.channels if name.casefold() not in folded]
     # Rotations are the one part that the app can leave out, and tongueOut came with a later version.
-    if missing and set(missing) <= {*ROTATIONS, "tongueOut"}:
-        folded, header = [*folded, *(name.casefold() for name in missing)], [*header, *missing]
+    if lacking and set(lacking) <= {*ROTATIONS, "tongueOut"}:
+        folded, header = [*folded, *(name.casefold() for name in lacking)], [*header, *lacking]
     columns = columns_of(path, header, space)
     at_time = folded.index("timecode")
     times, values, numbers = [], [], []
@@ -137,17 +137,17 @@ def read_live_link(path: Path) -> ParameterClip:
         seconds = seconds_of(row[at_time]) if len(row) > at_time else None
         if seconds is None:
             raise FaceDiffError(
-                f"{path}: row {number} has the timecode {quoted(row[at_time] if len(row) > at_time else '')}; expected "
+                f"{path}: row {number} has the timecode {quoted(row[at_time : at_time + 1])}; expected "
                 f"hours:minutes:seconds:sixtieths"
             )
         times.append(seconds)
         numbers.append(number)
-        values.append(_numbers(path, number, [*row, *("0" for _ in missing)], columns, len(header)))
-    return _timed(path, np.array(times), _with_mirrored(np.array(values)), missing, numbers)
+        values.append(_numbers(path, number, [*row, *("0" for _ in lacking)], columns, len(header)))
+    return _timed(path, np.array(times), _with_mirrored(np.array(values)), lacking, numbers)
 
 
 def mirrored(rotations: Values) -> Values:
-    """Rotations (..., 9) of head and eyes in the app's mirrored frame, of those about a right-handed face's axes.
+    """Rotations (..., 9) of head and eyes from a right-handed face's axes to the app's mirrored frame.
 
     Radians both; the function is its own inverse.
     """
@@ -155,13 +155,13 @@ def mirrored(rotations: Values) -> Values:
 
 
 def _with_mirrored(values: Values) -> Values:
-    """Values (T, 61) with the rotations of the other frame."""
+    """Values (T, 61) with rotations in the other frame."""
     return (
         np.concatenate([values[:, : len(ARKIT)], mirrored(values[:, len(ARKIT) :])], axis=1) if len(values) else values
     )
 
 
-def _timed(path: Path, clock: Array, values: Values, missing: list[str], numbers: list[int]) -> ParameterClip:
+def _timed(path: Path, clock: Array, values: Values, lacking: list[str], numbers: list[int]) -> ParameterClip:
     if len(clock) < 2:
         raise FaceDiffError(f"{path}: holds {len(clock)} rows; expected two at least, for their rate; record it again")
     # Past midnight the clock begins again.
@@ -172,7 +172,7 @@ def _timed(path: Path, clock: Array, values: Values, missing: list[str], numbers
         raise FaceDiffError(f"{path}: row {row} is no later than the one before it; sort the rows by their timecode")
     rate = rate_of(clock)
     space = layout("live_link")
-    space = replace(space, absent=(*space.absent, *missing))
+    space = replace(space, absent=(*space.absent, *lacking))
     clip = ParameterClip(
         path.stem, checked(path, values, rate), space, rate, clock - clock[0], float(clock[0]), layout="live_link"
     )
@@ -216,42 +216,33 @@ def read_audio2face(path: Path) -> ParameterClip:
     if "timecode" not in folded or not shapes:
         raise FaceDiffError(f"{path}: has no columns timeCode and {PREFIX}jawOpen …; {REMEDY}")
     space = layout("audio2face")
-    short = [name.strip()[len(PREFIX) :] if name.strip()[len(PREFIX) :] in shapes else "" for name in header]
-    absent = [name for name in space.channels if name.casefold() not in {one.casefold() for one in shapes}]
-    columns = columns_of(path, [*short, *absent], space)
-    wide = len(header) + len(absent)
+    names = [name.strip()[len(PREFIX) :] if name.strip()[len(PREFIX) :] in shapes else "" for name in header]
+    lacking = [name for name in space.channels if name.casefold() not in {one.casefold() for one in shapes}]
+    columns = columns_of(path, [*names, *lacking], space)
+    wide = len(header) + len(lacking)
     at_time = folded.index("timecode")
     values = []
     times = []
     for number, row in enumerate(rows, start=2):
-        full = [*row, *("0" for _ in absent)]
+        full = [*row, *("0" for _ in lacking)]
         times.append(_numbers(path, number, full, [at_time], wide)[0])
         values.append(_numbers(path, number, full, columns, wide))
     clock = np.array(times)
     if len(clock) < 2 or not (np.isfinite(clock).all() and (np.diff(clock) > 0).all()):
         raise FaceDiffError(f"{path}: its times do not ascend, or there is one row only; write it again")
     rate = rate_of(clock)
-    known = replace(space, absent=tuple(absent))
-    return ParameterClip(
-        path.stem,
-        checked(path, np.array(values), rate),
-        known,
-        rate,
-        clock - clock[0],
-        float(clock[0]),
-        None,
-        "audio2face",
-    )
+    numbers, space = checked(path, np.array(values), rate), replace(space, absent=tuple(lacking))
+    return ParameterClip(path.stem, numbers, space, rate, clock - clock[0], float(clock[0]), layout="audio2face")
 
 
 def write_audio2face(path: Path, clip: ParameterClip) -> None:
-    """Write weights as Audio2Face's service does; the arguments are those of :func:`write_live_link`."""
+    """Write weights as Audio2Face's service does; arguments as in :func:`write_live_link`."""
     values, space = permuted(clip.values, clip.space, layout("audio2face"))
-    kept = [index for index, name in enumerate(space.channels) if name not in space.absent]
+    present = [index for index, name in enumerate(space.channels) if name not in space.absent]
     times = np.arange(len(values)) / clip.frame_rate if clip.times is None else clip.times
-    header = ["timeCode", *(f"{PREFIX}{space.channels[index]}" for index in kept)]
+    header = ["timeCode", *(f"{PREFIX}{space.channels[index]}" for index in present)]
     rows = (
-        [repr(round(clip.start + float(seconds), 9)), *map(shortest, row[kept])]
+        [repr(round(clip.start + float(seconds), 9)), *map(shortest, row[present])]
         for seconds, row in zip(times, values, strict=True)
     )
     with atomic(path) as temporary:
@@ -260,11 +251,7 @@ def write_audio2face(path: Path, clip: ParameterClip) -> None:
 
 def _numbers(path: Path, number: int, row: list[str], columns: list[int], width: int) -> list[float]:
     """Cells of a row as numbers."""
-    try:
+    with damaged(f"{path}: row {number}", f"expected numbers in the {width} columns of the header"):
         if len(row) != width:
-            raise ValueError(f"{len(row)} cells for {width} columns")
+            raise ValueError(f"has {len(row)} cells")
         return [float(row[column]) for column in columns]
-    except ValueError as error:
-        raise FaceDiffError(
-            f"{path}: row {number} holds no numbers of the header's columns ({quoted(str(error))})"
-        ) from error

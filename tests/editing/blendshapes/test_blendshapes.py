@@ -208,7 +208,7 @@ def test_a_region_looks_at_its_vertices_only() -> None:
     spoilt[:, 20:] += 0.05
     found = solve(replace(animation, vertices=spoilt), made, replace(PLAIN, region="lips"))
     assert found.values == pytest.approx(known, abs=1e-6)
-    with pytest.raises(FaceDiffError, match=r'no region "lip"; did you mean "lips"'):
+    with pytest.raises(FaceDiffError, match=r'no region "lip": did you mean "lips"'):
         solve(animation, made, replace(PLAIN, region="lip"))
 
 

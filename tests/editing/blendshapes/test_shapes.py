@@ -104,7 +104,7 @@ def test_shapes_that_differ_among_themselves_are_refused(folder: Path) -> None:
         read_shapes(folder, GRID)
     for file in folder.glob("*.obj"):
         file.unlink()
-    with pytest.raises(FaceDiffError, match="holds no shapes"):
+    with pytest.raises(FaceDiffError, match="holds 0 shapes"):
         read_shapes(folder, GRID)
 
 

@@ -79,7 +79,7 @@ def test_what_keys_stand_for_is_refused_beside_them(make_animation: Callable[...
     both = Direction([Key(0, "lids", 0.5)], instead_of=("acting", "blinks")).save(tmp_path / "both.json")
     blinks = Direction([Key(0, "lids", 0.5)], instead_of=("blinks",)).save(tmp_path / "blinks.json")
     for path, option, *value in ((both, "acting", "prosody"), (both, "blinks"), (blinks, "blinks")):
-        with pytest.raises(FaceDiffError, match=f"{path.name}: instead_of: .*omit --{option}"):
+        with pytest.raises(FaceDiffError, match=f"{path.name}: instead_of: .*--{option}"):
             parsed("--direction", str(path), f"--{option}", *value)
     parsed("--direction", str(blinks), "--acting", "prosody", "--sway")
     # The animation goes on saying so, with the keys of both if it is changed twice.
@@ -89,11 +89,11 @@ def test_what_keys_stand_for_is_refused_beside_them(make_animation: Callable[...
     assert Direction.parse(again.metadata["direction"], "again").instead_of == ("blinks", "acting")
     # Nor is it done again in an animation that it is part of already.
     blinking = apply_controls(make_animation(2), parsed("--blinks"))
-    with pytest.raises(FaceDiffError, match="blinks.json: instead_of: .*as it was before"):
+    with pytest.raises(FaceDiffError, match="blinks.json: .*instead_of.*as it was before"):
         apply_controls(blinking, parsed("--direction", str(blinks)))
     apply_controls(blinking, AnimationControls(direction=later))
     others = Direction([Key(1, "lids", 0.2)], "others", instead_of=("blinks",))
-    with pytest.raises(FaceDiffError, match="others: instead_of: .*as it was before"):
+    with pytest.raises(FaceDiffError, match="others: .*instead_of.*as it was before"):
         apply_controls(again, AnimationControls(direction=others))
 
 

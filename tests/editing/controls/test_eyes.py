@@ -144,10 +144,10 @@ def test_blinks_in_another_unit_and_of_another_topology(
     with pytest.raises(FaceDiffError, match="moves a lid by"):
         read_eyes(eyes_folder / "mm.npz", template)
     np.savez(eyes_folder / "lids_only.npz", closing=eyes.closing)
-    with pytest.raises(FaceDiffError, match=r"has shape \(5875, 3\); the face has \(900, 3\)"):
+    with pytest.raises(FaceDiffError, match=r"has shape \(5875, 3\) .* on a face of shape \(900, 3\)"):
         read_eyes(eyes_folder / "lids_only.npz", template[:900])
     animation = make_animation(2)
-    with pytest.raises(FaceDiffError, match="gaze: eyes .* does not say which vertices are the eyeballs"):
+    with pytest.raises(FaceDiffError, match="gaze: eyes .* has no eyeballs"):
         apply_controls(animation, parsed("--gaze", "--eyes", str(eyes_folder / "lids_only.npz")))
     np.savez(eyes_folder / "balls_only.npz", eyeball=eyes.eyeballs[0])
     with pytest.raises(FaceDiffError, match="does not say how the lids shut"):

@@ -14,7 +14,7 @@ from facediff.cli.app import main
 from facediff.export import write_animations
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
-from facediff.mesh.glb import Glb, wears_more
+from facediff.mesh.glb import Glb, has_materials_or_targets
 from facediff.mesh.glb_scene import placed_parts
 from tests.fakes.avatar import AvatarPart, avatar_parts, normals_of, write_avatar
 from tests.fakes.glb_targets import pack
@@ -196,14 +196,14 @@ def test_the_command_writes_into_the_avatar_unless_the_bare_face_is_asked_for(
     assert main([*words, "-o", str(source)]) == 2
     write_animations(tmp_path / "into.glb", [talk(source, parts)], into=source)
     assert opened(tmp_path / "into.glb").content["images"] == had["images"]
-    assert not wears_more(tmp_path / "talk.npz")
+    assert not has_materials_or_targets(tmp_path / "talk.npz")
 
 
 def test_an_avatar_of_a_plain_colour_keeps_it(tmp_path: Path) -> None:
     bare = {"asset": {"version": "2.0"}, "meshes": [{"primitives": [{"attributes": {}}]}]}
     (tmp_path / "bare.glb").write_bytes(pack(bare, b""))
     (tmp_path / "plain.glb").write_bytes(pack({**bare, "materials": [{"name": "skin"}]}, b""))
-    assert [wears_more(tmp_path / name) for name in ("bare.glb", "plain.glb")] == [False, True]
+    assert [has_materials_or_targets(tmp_path / name) for name in ("bare.glb", "plain.glb")] == [False, True]
 
 
 def test_a_mesh_shown_twice_moves_where_it_should(tmp_path: Path, parts: dict[str, AvatarPart]) -> None:

@@ -14,7 +14,7 @@ from facediff.editing import face_features
 from facediff.editing.correspondence import Correspondence, correspond
 from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
 from facediff.editing.fit_check import check_fit
-from facediff.editing.retargeting import carry, carry_checked
+from facediff.editing.retargeting import transfer, transfer_checked
 from facediff.mesh import Mesh
 from facediff.mesh.mesh import triangle_areas
 from tests.fakes.heads import FAMILY, INTERIOR, Head, person, sealed_lips, talking
@@ -28,7 +28,7 @@ def animation() -> Animation:
 
 def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence]:
     found = correspond(animation.template, animation.triangles, head.vertices, head.faces)
-    return carry(animation, found, Mesh(head.vertices, head.faces.astype(np.int32))), found
+    return transfer(animation, found, Mesh(head.vertices, head.faces.astype(np.int32))), found
 
 
 QUICK = ("slit mask",)
@@ -43,7 +43,7 @@ def test_a_head_from_elsewhere_speaks_or_is_refused(animation: Animation, name: 
     head = FAMILY[name]()
     mesh = Mesh(head.vertices, head.faces.astype(np.int32))
     found = correspond(animation.template, animation.triangles, head.vertices, head.faces)
-    made, found, report = carry_checked(animation, found, mesh)
+    made, found, report = transfer_checked(animation, found, mesh)
     assert report.good == (head.alive and name not in RAGGED), report.faults
     if not report.good:
         return
@@ -118,7 +118,7 @@ def test_wrecks_are_named(animation: Animation) -> None:
     """The puppet's own face, on which lips are glued, torn or swapped by hand."""
     whole = Mesh(animation.template.astype(np.float64), animation.triangles)
     found = correspond(whole.vertices, whole.faces, whole.vertices, whole.faces)
-    good = carry(animation, found, whole)
+    good = transfer(animation, found, whole)
     assert check_fit(animation, good, found).good
     pairs = animation.inner_lip_pairs
     assert pairs is not None
@@ -137,14 +137,14 @@ def test_wrecks_are_named(animation: Animation) -> None:
         report = check_fit(animation, replace(good, vertices=vertices), found)
         assert not report.good
     still = replace(animation, vertices=np.repeat(animation.template[None], 3, axis=0))
-    assert check_fit(still, carry(still, found, whole), found).good
+    assert check_fit(still, transfer(still, found, whole), found).good
 
 
 def test_wrecks_of_eyes_and_forehead_are_named(animation: Animation) -> None:
     """The puppet's own face with one eye that stays open, lids that pass, lids that stay open, and a torn forehead."""
     whole = Mesh(animation.template.astype(np.float64), animation.triangles)
     found = correspond(whole.vertices, whole.faces, whole.vertices, whole.faces)
-    good = carry(animation, found, whole)
+    good = transfer(animation, found, whole)
     report = check_fit(animation, good, found)
     assert report.good
     assert report.eyes is not None
@@ -165,7 +165,7 @@ def test_wrecks_of_eyes_and_forehead_are_named(animation: Animation) -> None:
     for word, fault in zip(("shut", "shut", "pass", "forehead"), words, strict=True):
         assert word in fault
     blind = replace(animation, vertices=animation.vertices[:9])
-    eyes = check_fit(blind, carry(blind, found, whole), found).eyes
+    eyes = check_fit(blind, transfer(blind, found, whole), found).eyes
     assert eyes is not None
     assert eyes.lid_gap is None  # an animation that does not blink says nothing of the lids
 

@@ -19,7 +19,7 @@ from facediff.editing.landmarks import (
     FLAME_VERTICES,
     NAMES,
     Landmarks,
-    Places,
+    SurfacePoints,
     common_landmarks,
     known_landmarks,
     known_topology,
@@ -105,8 +105,8 @@ SEEN = ("nose_tip", "upper_lip_middle", "lower_lip_middle")
 
 
 def some() -> Landmarks:
-    inside = Places(np.array([[4, 4, 4], [1, 2, 3]]), np.array([[1.0, 0.0, 0.0], [0.25, 0.5, 0.25]]))
-    return Landmarks(("nose_tip", "mole"), Places.of_vertices(np.array([124, 7])), inside)
+    inside = SurfacePoints(np.array([[4, 4, 4], [1, 2, 3]]), np.array([[1.0, 0.0, 0.0], [0.25, 0.5, 0.25]]))
+    return Landmarks(("nose_tip", "mole"), SurfacePoints.of_vertices(np.array([124, 7])), inside)
 
 
 def test_landmarks_come_back_as_they_were(tmp_path: Path) -> None:
@@ -150,12 +150,12 @@ def test_a_landmark_within_a_triangle_is_held_as_a_vertex_is() -> None:
     random = np.random.default_rng(0)
     some_faces = random.choice(len(corners), 12, replace=False)
     weights = random.dirichlet([2, 2, 2], 12)
-    target = Places(corners[some_faces], weights)
+    target = SurfacePoints(corners[some_faces], weights)
     turn = turned(25, -10, 40)
     # The same places, turned, as points of triangles of the source.
     wanted = target.points(targets) @ turn.T
     there = nearest(Surface(points, faces), wanted, np.zeros_like(wanted), 0.0)
-    marks = Landmarks(("",) * 12, Places(there.corners, there.weights), target)
+    marks = Landmarks(("",) * 12, SurfacePoints(there.corners, there.weights), target)
     found = correspond(points, faces, 3 * targets, corners, landmarks=marks)
     places = np.einsum("vk,vkd->vd", found.weights, points[found.corners])  # of the target's vertices on the source
     away = np.linalg.norm(target.points(places) - marks.source.points(points), axis=1)
@@ -177,7 +177,7 @@ def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refuse
 ) -> None:
     given: list[Landmarks | None] = []
 
-    def refused(*_: object, landmarks: Landmarks | None, shown: object) -> None:
+    def refused(*_: object, landmarks: Landmarks | None, face_triangles: object) -> None:
         given.append(landmarks)
         raise FaceDiffError(f"attempt {len(given)}")
 
@@ -187,7 +187,7 @@ def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refuse
     mesh = trimesh.Trimesh(LONG(HEAD.vertices / 1000), HEAD.faces[::-1], process=False)
     mesh.export(target)
     with pytest.raises(FaceDiffError, match="attempt 2"):
-        retargeting.retarget(animation, target, judge=lambda *_: None)
+        retargeting.retarget(animation, target, check=lambda *_: None)
     first, second = given
     assert first is None
     assert second is not None
@@ -195,7 +195,7 @@ def test_named_landmarks_of_both_topologies_are_tried_where_the_result_is_refuse
     given.clear()
     (tmp_path / "own.csv").write_text("nose_tip,5\n")
     with pytest.raises(FaceDiffError, match="attempt 1"):  # a person's own landmarks are the last word
-        retargeting.retarget(animation, target, None, tmp_path / "own.csv", judge=lambda *_: None)
+        retargeting.retarget(animation, target, None, tmp_path / "own.csv", check=lambda *_: None)
     assert given[0] is not None
     assert given[0].nearest_vertices.tolist() == [[puppet_landmarks()["nose_tip"], 5]]
 
@@ -208,7 +208,7 @@ def test_six_landmarks_cure_a_mask_that_is_refused_without() -> None:
 
     def report(landmarks: np.ndarray | None) -> FitReport:
         found = correspond(animation.template, animation.triangles, head.vertices, head.faces, landmarks=landmarks)
-        return check_fit(animation, retargeting.carry(animation, found, Mesh(head.vertices, head.faces)), found)
+        return check_fit(animation, retargeting.transfer(animation, found, Mesh(head.vertices, head.faces)), found)
 
     assert not report(None).good
     found = report(pairs)

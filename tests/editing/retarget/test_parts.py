@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from facediff.animation import Animation, read_archive, write_archive
 from facediff.cli.app import main
 from facediff.editing.correspondence import correspond
+from facediff.editing.detached_parts import detached_parts
 from facediff.editing.face_features import find_features
-from facediff.editing.loose_pieces import loose_pieces
-from facediff.editing.retargeting import carry, parts_with_a_face, retarget
+from facediff.editing.retargeting import parts_with_a_face, retarget, transfer
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Mesh, read_mesh
@@ -82,7 +82,7 @@ def test_parts_with_a_face_are_named(animation: Animation, tmp_path: Path) -> No
         raise OptionError.naming("two.obj: is poor; see {pick}")
 
     with pytest.raises(OptionError) as caught:
-        retarget(animation, tmp_path / "two.obj", judge=refuse)
+        retarget(animation, tmp_path / "two.obj", check=refuse)
     assert "--part Face" in caught.value.on_command_line
     assert "--pick" in caught.value.on_command_line
 
@@ -142,9 +142,9 @@ def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
     seen = find_features(head.vertices, head.faces, features)
     assert seen is not None
     alone = [np.arange(8) + first for name, first in begins.items() if name != "skin"]
-    loose = loose_pieces(Surface(vertices, faces), whole, features, seen, alone)
+    detached = detached_parts(Surface(vertices, faces), whole, features, seen, alone)
     kinds = {
-        name: "jaw" if first in loose.jaw else "still" if first in loose.still else "skin"
+        name: "jaw" if first in detached.jaw else "still" if first in detached.still else "skin"
         for name, first in begins.items()
     }
     assert {name for name, kind in kinds.items() if kind == "jaw"} == {
@@ -152,17 +152,17 @@ def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
     }  # fmt: skip
     assert {name for name, kind in kinds.items() if kind == "skin"} == {"skin", "moustache", "beard", "brow", "lash"}
     # What lies on the skin moves with it, and lashes with the edge of their lid.
-    assert {name for name, first in begins.items() if first in loose.followers} == {
+    assert {name for name, first in begins.items() if first in detached.followers} == {
         "moustache",
         "beard",
         "brow",
         "lash",
     }
-    lash = np.isin(loose.followers, begins["lash"] + np.arange(8))
-    assert np.isin(loose.follower_corners[lash], eye.upper_seeds).all()
-    assert loose.follower_weights.sum(axis=1) == pytest.approx(1)
+    lash = np.isin(detached.followers, begins["lash"] + np.arange(8))
+    assert np.isin(detached.follower_corners[lash], eye.upper_seeds).all()
+    assert detached.follower_weights.sum(axis=1) == pytest.approx(1)
     # Lashes that are one strip bend with the edge.
-    assert len(np.unique(loose.follower_corners[lash], axis=0)) > 1
+    assert len(np.unique(detached.follower_corners[lash], axis=0)) > 1
 
 
 @pytest.mark.parametrize("second_edition", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -174,7 +174,7 @@ def test_single_lashes_keep_their_shape_in_a_blink_and_turn_together(
     skin = coarser(*second(TILTED, *APART), 0.5)
     head = joined(skin=skin, balls=only(TILTED, *BALLS), lashes=only(TILTED, "lash_"))
     correspondence = correspond(blinking.template, blinking.triangles, head.vertices, head.faces)
-    retargeted = carry(blinking, correspondence, Mesh(head.vertices, head.faces.astype(np.int32)))
+    retargeted = transfer(blinking, correspondence, Mesh(head.vertices, head.faces.astype(np.int32)))
     # A lash is a triangle whose first two corners, in the order of its vertices, are the root.
     lashes = np.sort(np.unique(np.sort(head.faces[head.parts["lashes"]], axis=1), axis=0))
     lashes = lashes[(np.diff(lashes, axis=1) > 0).all(axis=1)]
@@ -251,7 +251,7 @@ def test_a_swaying_head_takes_its_parts_along_and_leaves_the_body(animation: Ani
     moved[1] = still[1] @ matrix.T + head[1, 3:]
     swaying = Animation("sway", moved, animation.template, 25.0, faces=animation.triangles, head=head)
     found = correspond(*face, points, both.faces)
-    made = carry(swaying, found, Mesh(points, both.faces.astype(np.int32)))
+    made = transfer(swaying, found, Mesh(points, both.faces.astype(np.int32)))
     expected = 100 * (both.vertices @ matrix.T + head[1, 3:]) @ turn.T + [5.0, 0, 2]
     upper = slice(0, len(face[0]) + 8)
     assert made.vertices[1, upper] == pytest.approx(expected[upper], abs=0.01)
@@ -259,6 +259,6 @@ def test_a_swaying_head_takes_its_parts_along_and_leaves_the_body(animation: Ani
     assert made.vertices[0] == pytest.approx(points, abs=1e-5)
     assert made.head is None
     some = Mesh(points[upper], both.faces[: -2 * len(hull) + len(hull)].astype(np.int32))
-    alone = carry(swaying, correspond(*face, some.vertices, some.faces), some)
+    alone = transfer(swaying, correspond(*face, some.vertices, some.faces), some)
     assert alone.vertices[1] == pytest.approx(expected[upper], abs=0.01)
     assert alone.still().vertices[1] == pytest.approx(points[upper], abs=1e-4)

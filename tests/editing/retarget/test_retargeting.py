@@ -10,7 +10,7 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.correspondence import Correspondence, correspond
-from facediff.editing.retargeting import carried_region, carry, carry_displacements, unit_of
+from facediff.editing.retargeting import carried_region, transfer, transfer_displacements, unit_of
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
 from tests.fakes.small_face import CONTROLS, Rig, Shape, build_face, build_rig, lip_pairs
@@ -107,7 +107,7 @@ def found(rig: Rig, faces: np.ndarray, far_copy: Arrays) -> Correspondence:
 def test_one_mesh_corresponds_to_itself_exactly(animation: Animation) -> None:
     same = correspond(animation.template, animation.triangles, animation.template, animation.triangles)
     assert not same.distances.any()
-    made = carry(animation, same, Mesh(animation.template.astype(np.float64), animation.triangles))
+    made = transfer(animation, same, Mesh(animation.template.astype(np.float64), animation.triangles))
     assert np.array_equal(made.vertices, animation.vertices)
     assert np.array_equal(made.template, animation.template)
     assert np.array_equal(made.regions["lips"], animation.regions["lips"])
@@ -121,7 +121,7 @@ def test_a_resampled_copy_far_away_and_in_another_order(
 ) -> None:
     assert found.similarity.scale == pytest.approx(1000, rel=1e-6)
     assert found.similarity.rotation == pytest.approx(turned(10), abs=1e-6)
-    assert error(carry_displacements(found, motion), far_copy[2]) < LIMIT
+    assert error(transfer_displacements(found, motion), far_copy[2]) < LIMIT
     assert found.distances.max() < 1.0  # millimetres
     assert found.weights.min() >= 0
     assert found.weights.sum(axis=1) == pytest.approx(1)
@@ -132,7 +132,7 @@ def test_without_a_similarity_the_error_would_be_seen(
     motion: np.ndarray, far_copy: Arrays, found: Correspondence
 ) -> None:
     """The figure fails where it should: a motion that is not turned with the mesh errs far more than the limit."""
-    wrong = carry_displacements(found, motion) @ turned(10)
+    wrong = transfer_displacements(found, motion) @ turned(10)
     assert error(wrong, far_copy[2]) > 5 * LIMIT
 
 
@@ -140,7 +140,7 @@ def test_without_a_similarity_the_error_would_be_seen(
 def test_a_permuted_copy_is_found_vertex_by_vertex(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
     vertices, triangles, truth = reordered(rig.neutral, faces, motion)
     found = correspond(rig.neutral, faces, vertices, triangles)
-    assert error(carry_displacements(found, motion), truth) < 1e-6
+    assert error(transfer_displacements(found, motion), truth) < 1e-6
 
 
 @pytest.mark.slow
@@ -161,17 +161,17 @@ def test_a_coarser_copy_with_vertices_of_its_own(rig: Rig, faces: np.ndarray) ->
     source, corners, _ = finer(rig.neutral, faces, np.zeros((1, len(rig.neutral), 3)))
     found = correspond(source, corners, coarse, cut)
     assert len(coarse) < len(source)
-    assert error(carry_displacements(found, field(source)), field(coarse)) < LIMIT
+    assert error(transfer_displacements(found, field(source)), field(coarse)) < LIMIT
 
 
 @pytest.mark.slow
 def test_another_speakers_face_moves_its_own_lips(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> None:
     """Without knowing that the topology is the same, each vertex moves about as its own counterpart does."""
     other = build_rig(Shape(width=0.5, lips=0.7, nose_width=0.6, jaw=0.5, mouth_width=0.5, cheeks=0.5)).neutral
-    known = carry_displacements(correspond(rig.neutral, faces, other, faces), motion)
+    known = transfer_displacements(correspond(rig.neutral, faces, other, faces), motion)
     vertices, triangles, truth = reordered(other, faces, known)
     found = correspond(rig.neutral, faces, vertices, triangles)
-    assert error(carry_displacements(found, motion), truth) < 0.1
+    assert error(transfer_displacements(found, motion), truth) < 0.1
 
 
 @pytest.mark.slow
@@ -179,7 +179,7 @@ def test_another_axis_up(rig: Rig, faces: np.ndarray, motion: np.ndarray) -> Non
     turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
     vertices, triangles, truth = reordered(rig.neutral, faces, motion)
     found = correspond(rig.neutral, faces, 100 * vertices @ turn.T, triangles)
-    assert error(carry_displacements(found, motion), 100 * truth @ turn.T) < 1e-5
+    assert error(transfer_displacements(found, motion), 100 * truth @ turn.T) < 1e-5
 
 
 @pytest.mark.slow
@@ -189,7 +189,7 @@ def test_what_lies_far_away_stands_still(rig: Rig, faces: np.ndarray, motion: np
     vertices = np.concatenate([rig.neutral, hat])
     flipped = np.concatenate([faces, [[1008, 1009, 1010]]])[:, ::-1]
     found = correspond(rig.neutral, faces, vertices, flipped)
-    moved = carry_displacements(found, motion)
+    moved = transfer_displacements(found, motion)
     assert not moved[:, 1008:].any()
     assert error(moved[:, :1008], motion) < 1e-5
     assert np.array_equal(found.target_faces, flipped)
@@ -206,7 +206,7 @@ def test_landmarks_lay_a_part_of_a_face_onto_the_whole(rig: Rig, faces: np.ndarr
     some = kept[np.linspace(0, len(kept) - 1, 12).astype(int)]
     pairs = np.stack([some, place[some]], axis=1)
     found = correspond(rig.neutral, faces, mask, cut, landmarks=pairs)
-    assert error(carry_displacements(found, motion), 3 * motion[:, kept] @ turned(30).T) < LIMIT
+    assert error(transfer_displacements(found, motion), 3 * motion[:, kept] @ turned(30).T) < LIMIT
     with pytest.raises(FaceDiffError, match=r"landmarks: name source vertex 5000 of 1008"):
         correspond(rig.neutral, faces, mask, cut, landmarks=np.array([[5000, 0]]))
 
@@ -215,7 +215,7 @@ def test_carried_animation_has_unit_regions_and_metadata(
     animation: Animation, far_copy: Arrays, found: Correspondence
 ) -> None:
     colours = np.zeros((len(far_copy[0]), 3), np.uint8)
-    made = carry(animation, found, Mesh(far_copy[0], far_copy[1].astype(np.int32), colours))
+    made = transfer(animation, found, Mesh(far_copy[0], far_copy[1].astype(np.int32), colours))
     assert made.unit == "mm"
     assert made.vertices.dtype == np.float32
     assert error(made.vertices - made.template.astype(np.float64), far_copy[2]) < LIMIT
@@ -224,7 +224,7 @@ def test_carried_animation_has_unit_regions_and_metadata(
     assert "1008 vertices" in made.metadata["carried"]
     # The correspondence can be used for another identity's animation as well.
     wide = replace(animation, template=animation.template * [1.1, 1, 1], vertices=animation.vertices * [1.1, 1, 1])
-    assert carry(wide, found, Mesh(far_copy[0], far_copy[1].astype(np.int32))).unit == "mm"
+    assert transfer(wide, found, Mesh(far_copy[0], far_copy[1].astype(np.int32))).unit == "mm"
     # Lips open as far as those of the source do.
     assert made.inner_lip_pairs is not None
     gaps = [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from facediff.editing.correspondence import averaging, edges_of, partners, pieces, smooth_field
+from facediff.editing.correspondence import averaging, edges_of, part_pairs, pieces, smooth_field
 from facediff.editing.surface import Surface, nearest, vertex_normals
 
 RNG = np.random.default_rng(0)
@@ -72,7 +72,7 @@ def test_pieces_find_their_partners() -> None:
     assert len(np.unique(pieces(source))) == 3
     moved = together(lower, ball(1), upper)
     laid = Surface(moved.vertices + [0, 0.03, 0], moved.faces)
-    places = partners(source, laid)
+    places = part_pairs(source, laid)
     found = places.nearest(laid.vertices, laid.normals)
     count = len(lower.vertices)
     assert (found.corners[:count] >= len(source.vertices) - count).all()
@@ -122,6 +122,6 @@ def test_pieces_that_moved_towards_one_anothers_places_keep_their_partners() -> 
     upper, lower = ball(1, (0, 0.12, 0.5), 0.2), ball(1, (0, -0.03, 0.5), 0.2)
     source = together(ball(2), upper, lower)
     laid = Surface(source.vertices + [0, 0.1, 0], source.faces)
-    found = partners(source, laid).nearest(laid.vertices, laid.normals)
+    found = part_pairs(source, laid).nearest(laid.vertices, laid.normals)
     count = len(lower.vertices)
     assert (found.corners[-count:] >= len(source.vertices) - count).all()

@@ -1,4 +1,4 @@
-"""What pieces of a head do that the animation's face lacks: teeth, tongues, eyeballs, lashes, hair, a body."""
+"""Motion of parts that the animation's face lacks: teeth, tongues, eyeballs, lashes, hair, a body."""
 
 from __future__ import annotations
 
@@ -32,57 +32,62 @@ RISES = 0.25  # A lash may lie so much of its rise further from its own lid than
 
 
 @dataclass(frozen=True, eq=False)
-class Loose:
+class DetachedParts:
     """Pieces that move as a whole: with the jaw, or not at all. All others follow the skin."""
 
     jaw: Indices  # vertices of lower teeth and a tongue
     still: Indices  # vertices of all that stands still
-    place: Nearest  # (1,) the place of the jaw on the source
+    jaw_point: Nearest  # (1,) the point of the source that the jaw moves with
     followers: Indices  # (A,) vertices of what lies on the mesh's own skin and moves with it
     follower_corners: Indices  # (A, 3) the skin's vertices that they move with
     follower_weights: Array  # (A, 3)
 
 
-def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Features, alone: list[Indices]) -> Loose:
+def detached_parts(
+    source: Surface, laid: Surface, features: Features, target_features: Features, unpaired: list[Indices]
+) -> DetachedParts:
     """Sort the pieces of a mesh that is laid onto a source by where they are.
 
-    Teeth and tongues lie behind the lips; those below the gap between both rows of teeth follow the jaw. What else lies
-    inside the head stands still, and so does what is large, such as hair or a body, unless it lies about the mouth as a
-    beard does, and what is worn in front of the skin, such as glasses. Brows and a beard move with the skin that they
-    lie on, and lashes with the edge of their lid.
+    Teeth and tongues lie behind the lips; below the gap between both rows of teeth they follow the jaw. Other pieces
+    inside the head stand still, and so do large ones, such as hair or a body, unless they lie about the mouth as a
+    beard does, and pieces in front of the skin, such as glasses. Brows and a beard move with the skin below them, and
+    lashes with the edge of their lid.
 
     Args:
         source: the animation's face.
         laid: the mesh, in the source's place.
         features: openings of the source's face.
-        seen: those of the mesh's.
-        alone: vertices of each of the mesh's pieces that has no partner among the source's pieces.
+        target_features: openings of the mesh.
+        unpaired: vertices of each of the mesh's pieces without a partner among the source's pieces.
     """
     from scipy.spatial import cKDTree
 
-    mouth, width = seen.mouth.centre, seen.mouth.width
-    place = nearest(
+    mouth, width = target_features.mouth.centre, target_features.mouth.width
+    jaw_point = nearest(
         Surface(source.vertices, source.faces[features.skin[source.faces[:, 0]]]),
         features.mouth.centre[None] - [[0.0, 0.45 * features.mouth.width, 0.0]],
         np.array([[0.0, 0.0, 1.0]]),
     )
     none = np.zeros(0, np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3))
-    alone = [some for some in alone if len(some) and not seen.skin[some].any()]
-    if not alone:
-        return Loose(none[0], none[0], place, *none)
-    which, starts = np.concatenate(alone), np.cumsum([0, *(len(some) for some in alone[:-1])])
-    points, counts = laid.vertices[which], np.array([len(some) for some in alone])
+    unpaired = [some for some in unpaired if len(some) and not target_features.skin[some].any()]
+    if not unpaired:
+        return DetachedParts(none[0], none[0], jaw_point, *none)
+    which, starts = np.concatenate(unpaired), np.cumsum([0, *(len(some) for some in unpaired[:-1])])
+    points, counts = laid.vertices[which], np.array([len(some) for some in unpaired])
 
     def mean(values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, starts) / counts.reshape(-1, *(1,) * (values.ndim - 1)))
 
     middle = mean(points)
     extent = (np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)).max(axis=1)
-    skin = laid.vertices[seen.skin]
+    skin = laid.vertices[target_features.skin]
     near = cKDTree(skin).query(points)[1]
     # Behind the nearest skin, by its normal, for most of a piece's vertices: eyeballs and gums poke through here and
     # there.
-    inside = mean((np.einsum("nd,nd->n", points - skin[near], laid.normals[seen.skin][near]) < 0).astype(float)) > 0.7
+    inside = (
+        mean((np.einsum("nd,nd->n", points - skin[near], laid.normals[target_features.skin][near]) < 0).astype(float))
+        > 0.7
+    )
     # Lips protrude, so that the line between them lies behind what hangs in front, such as a moustache.
     oral = (
         (np.linalg.norm(middle - mouth, axis=1) < ORAL * width) & (extent < SMALL * width) & (middle[:, 2] < mouth[2])
@@ -92,15 +97,18 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
     large = extent > LARGE * width
     lower = oral & (middle[:, 1] < _gap(middle[oral, 1], mouth[1], width))
     # What lies between the lids belongs to the eyeball: an iris, a cornea, a reflection.
-    between = _between_lids(points, starts, seen)
-    lash = lash_pieces(laid.vertices, alone, seen) & ~oral & ~large
+    between = _between_lids(points, starts, target_features)
+    lash = lash_pieces(laid.vertices, unpaired, target_features) & ~oral & ~large
     still = ~lower & ~lash & (oral | inside | between | (large & ~about))
     # What else is there lies on the skin, or is worn in front of it.
     left = np.flatnonzero(~lower & ~lash & ~still)
-    some = np.flatnonzero(np.isin(np.repeat(np.arange(len(alone)), counts), left))
+    some = np.flatnonzero(np.isin(np.repeat(np.arange(len(unpaired)), counts), left))
     on_skin = (
         nearest(
-            Surface(laid.vertices, laid.faces[seen.skin[laid.faces[:, 0]]]), points[some], np.zeros((len(some), 3)), 0.0
+            Surface(laid.vertices, laid.faces[target_features.skin[laid.faces[:, 0]]]),
+            points[some],
+            np.zeros((len(some), 3)),
+            0.0,
         )
         if len(some)
         else None
@@ -110,33 +118,33 @@ def loose_pieces(source: Surface, laid: Surface, features: Features, seen: Featu
         away[some] = on_skin.distances
         worn = np.array([np.median(away[first : first + count]) for first, count in zip(starts, counts, strict=True)])
         worn_piece = (worn > ON_SKIN * width) & ~about
-        worn_piece[[k for k in range(len(alone)) if k not in set(left)]] = False
+        worn_piece[[k for k in range(len(unpaired)) if k not in set(left)]] = False
         # Frames of glasses that were large stood still already; their pads touch the nose and belong to them.
         frames = np.repeat(worn_piece | (large & ~about & ~inside & (middle[:, 2] > mouth[2] - width)), counts)
         if frames.any():
             gap = cKDTree(points[frames]).query(points)[0]
             belongs = mean((gap < np.minimum(TOUCHES * width, np.maximum(away, 0.01 * width))).astype(float)) > 0.5
-            worn_piece |= belongs & np.isin(np.arange(len(alone)), left)
+            worn_piece |= belongs & np.isin(np.arange(len(unpaired)), left)
         still |= worn_piece
-        kept = ~np.repeat(worn_piece, counts)[some]
-        followers = which[some][kept], on_skin.corners[kept], on_skin.weights[kept]
+        on_skin_rows = ~np.repeat(worn_piece, counts)[some]
+        followers = which[some][on_skin_rows], on_skin.corners[on_skin_rows], on_skin.weights[on_skin_rows]
     else:
         followers = none
-    lashes = [some for some, is_lash in zip(alone, lash, strict=True) if is_lash]
-    rims = _rim_places(laid.vertices, lashes, seen)
-    return Loose(
+    lashes = [some for some, is_lash in zip(unpaired, lash, strict=True) if is_lash]
+    rims = _rim_places(laid.vertices, lashes, target_features)
+    return DetachedParts(
         which[np.repeat(lower, counts)],
         which[np.repeat(still, counts)],
-        place,
+        jaw_point,
         np.concatenate([followers[0], *lashes]),
         np.concatenate([followers[1], rims[0]]),
         np.concatenate([followers[2], rims[1]]),
     )
 
 
-def _between_lids(points: Array, starts: Indices, seen: Features) -> Mask:
+def _between_lids(points: Array, starts: Indices, features: Features) -> Mask:
     """Which pieces (P,) of points (N, 3) are seen in an eye's opening; points at its edge, as roots are, say little."""
-    eyes, inside = [eye for eye in seen.eyes if eye is not None], np.zeros(len(points), bool)
+    eyes, inside = [eye for eye in features.eyes if eye is not None], np.zeros(len(points), bool)
     x, y = points[:, 0], points[:, 1]
     for eye in eyes:
         top, bottom = (np.interp(x, side[:, 0], side[:, 1], -np.inf, -np.inf) for side in (eye.upper, eye.lower))
@@ -152,29 +160,29 @@ def _from_edges(points: Array, eye: Opening) -> Array:
     return np.asarray(cKDTree(np.concatenate([eye.upper, eye.lower])).query(points)[0])
 
 
-def lash_pieces(vertices: Array, pieces: list[Indices], seen: Features) -> Mask:
+def lash_pieces(vertices: Array, pieces: list[Indices], features: Features) -> Mask:
     """Which pieces of a mesh begin at the edge of a lid, and do not lie between both lids as an iris does.
 
     Args:
         vertices: (V, 3) of the mesh.
         pieces: the vertices of each piece.
-        seen: openings of the mesh's face.
+        features: openings of the mesh's face.
     """
     points, starts = vertices[np.concatenate(pieces)], np.cumsum([0, *(len(some) for some in pieces[:-1])])
     extent = (np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)).max(axis=1)
-    chosen = np.zeros(len(pieces), bool)
-    for eye in _open_eyes(vertices, seen):
+    is_lash = np.zeros(len(pieces), bool)
+    for eye in _open_eyes(vertices, features):
         away, width = _from_edges(points, eye.opening), eye.opening.width
         near = np.minimum.reduceat(away, starts) < LASH * width
-        chosen |= near & (np.maximum.reduceat(away, starts) < 0.5 * width) & (extent < LASHES * width)
-    return chosen & ~_between_lids(points, starts, seen)
+        is_lash |= near & (np.maximum.reduceat(away, starts) < 0.5 * width) & (extent < LASHES * width)
+    return is_lash & ~_between_lids(points, starts, features)
 
 
-def _open_eyes(vertices: Array, seen: Features) -> list[LidEdges]:
-    return [edges for eye in (0, 1) if (edges := lid_edges(vertices, seen, eye)) is not None]
+def _open_eyes(vertices: Array, features: Features) -> list[LidEdges]:
+    return [edges for eye in (0, 1) if (edges := lid_edges(vertices, features, eye)) is not None]
 
 
-def _rim_places(vertices: Array, lashes: list[Indices], seen: Features) -> tuple[Indices, Array]:
+def _rim_places(vertices: Array, lashes: list[Indices], features: Features) -> tuple[Indices, Array]:
     """The place on the edge of a lid that each vertex of lashes moves with, between two vertices of it.
 
     All vertices of a single lash have one place, that of its root, so that it keeps its shape.
@@ -182,15 +190,15 @@ def _rim_places(vertices: Array, lashes: list[Indices], seen: Features) -> tuple
     Args:
         vertices: (V, 3) of the mesh.
         lashes: the vertices of each piece, A in all.
-        seen: openings of the mesh's face.
+        features: openings of the mesh's face.
 
     Returns:
         The two vertices, the second one twice, and their weights, both (A, 3).
     """
     corners, weights = [np.zeros((0, 3), np.int64)], [np.zeros((0, 3))]
-    rims = [(rim, SINGLE * eye.opening.width) for eye in _open_eyes(vertices, seen) for rim in eye.rims]
+    rims = [(rim, SINGLE * eye.opening.width) for eye in _open_eyes(vertices, features) for rim in eye.rims]
     for some in lashes:
-        places, away = np.array([along(vertices[some], vertices[rim]) for rim, _ in rims]).transpose(1, 2, 0)
+        positions, away = np.array([along(vertices[some], vertices[rim]) for rim, _ in rims]).transpose(1, 2, 0)
         nearest_rim, nearest_own = away.argmin(axis=1), np.arange(len(some))
         # Where both lids meet, a lash that rises is an upper one.
         first, tip = away.min(axis=1).argsort()[[0, -1]]
@@ -199,10 +207,10 @@ def _rim_places(vertices: Array, lashes: list[Indices], seen: Features) -> tuple
         root = vertices[some[away[:, lid] <= away[:, lid].min() + ROOT * np.ptp(away[:, lid])]]
         if np.ptp(root, axis=0).max() < rims[lid][1]:
             nearest_rim[:], nearest_own[:] = lid, away[:, lid].argmin()
-        for rim, place in zip(nearest_rim, places[nearest_own, nearest_rim], strict=True):
-            low = min(int(place), len(rims[rim][0]) - 2)
+        for rim, position in zip(nearest_rim, positions[nearest_own, nearest_rim], strict=True):
+            low = min(int(position), len(rims[rim][0]) - 2)
             corners.append(rims[rim][0][[[low, low + 1, low + 1]]])
-            weights.append(np.array([[low + 1.0 - place, place - low, 0.0]]))
+            weights.append(np.array([[low + 1.0 - position, position - low, 0.0]]))
     return np.concatenate(corners), np.concatenate(weights)
 
 
