@@ -217,14 +217,6 @@ class Animation:
             if not in_range(frame):
                 raise FaceDiffError(f"{self.name}: frame {index} holds {OUT_OF_RANGE}; generate the motion again")
 
-    def speech_16k(self) -> npt.NDArray[np.float32] | None:
-        """The speech (S,) at 16 kHz, as models take it; None for a silent animation."""
-        if self.speech is None or self.sample_rate == SAMPLE_RATE:
-            return self.speech
-        from facediff.speech.audio import to_speech
-
-        return to_speech(self.speech, self.sample_rate, self.name)
-
     def sound(self) -> npt.NDArray[np.float32] | None:
         """The speech (S,) as long as the motion: cut, or padded with silence; None for a silent animation."""
         if self.speech is None:

@@ -87,9 +87,18 @@ def acted(kind: Acting, speech: Wave, frames: int, frame_rate: float, seed: int)
     return np.concatenate([performer.feed(speech), performer.finish(frames)])[:frames]
 
 
+def speech_16k(animation: Animation) -> Wave | None:
+    """An animation's speech (S,) at 16 kHz, as models take it; None for a silent animation."""
+    if animation.speech is None or animation.sample_rate == SAMPLE_RATE:
+        return animation.speech
+    from facediff.speech.audio import to_speech
+
+    return to_speech(animation.speech, animation.sample_rate, animation.name)
+
+
 def act(kind: Acting, animation: Animation, seed: int) -> Acted:
     """The values (T, 5) for an animation with its speech."""
-    speech = animation.speech_16k()
+    speech = speech_16k(animation)
     if speech is None:
         raise OptionError.naming(f"{animation.name}: {{acting}}: has no speech to act on; give it with {{speech}}")
     return acted(kind, speech, len(animation.vertices), animation.frame_rate, seed)

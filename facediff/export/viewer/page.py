@@ -17,6 +17,7 @@ from facediff.animation import Animation
 from facediff.animation.files import FORMAT as ARCHIVE
 from facediff.animation.options import ExportOptions
 from facediff.editing import direction
+from facediff.editing.acting import speech_16k
 from facediff.editing.expressiveness import ALL, region_factors
 from facediff.editing.procedural import neck
 from facediff.errors import FaceDiffError
@@ -136,7 +137,7 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
     speaking = next((animation for animation in animations if animation.speech is not None), None)
     sound = None
     if speaking is not None:  # it is stored as it is, three times as large at 48 kHz
-        sound = speech_wav(replace(speaking, speech=speaking.speech_16k(), sample_rate=SAMPLE_RATE))
+        sound = speech_wav(replace(speaking, speech=speech_16k(speaking), sample_rate=SAMPLE_RATE))
     compared: list[int] = []
     heat = None
     if truth is not None:
