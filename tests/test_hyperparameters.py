@@ -1,4 +1,4 @@
-"""Constructors whose options are a dataclass: the same options, documented, checked and stored as if they were arguments."""
+"""Options in a dataclass: the same options, documented, checked and stored as if they were arguments of a constructor."""
 
 from __future__ import annotations
 
