@@ -214,7 +214,8 @@ motion_space = Kind(
 )
 audio_encoder = Kind(
     "audio_encoder",
-    "facediff.models.audio_encoders facediff.models.speech_networks facediff.models.deepspeech",
+    "facediff.models.audio_encoders facediff.models.bundled_encoder facediff.models.speech_networks "
+    "facediff.models.deepspeech",
     "speech to one feature per frame",
     component=True,
 )
@@ -250,7 +251,8 @@ model = Kind(
 )
 corpus = Kind(
     "corpus",
-    "facediff.data.puppet facediff.data.biwi facediff.data.vocaset facediff.data.mead3d facediff.data.parametric",
+    "facediff.data.puppet facediff.data.biwi facediff.data.vocaset facediff.data.mead3d facediff.data.parametric "
+    "facediff.data.people",
     "a data set, as a LightningDataModule",
 )
 metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class")

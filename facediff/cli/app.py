@@ -49,6 +49,7 @@ COMMANDS = {
     ),
     "animate": Command("facediff.cli.animate:animate", "animate a face with a recording of speech"),
     "live": Command("facediff.cli.live:live", "animate live speech, and send it to engines and browsers"),
+    "person": Command("facediff.cli.track:person", "make a model of a person from a video", "prepare,render"),
     "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker, or on other voices"),
     "publish": Command(
         "facediff.cli.publish:publish", "write a trained model as a folder for others, or send it to the hub"
@@ -112,6 +113,9 @@ COMMANDS = {
     "data pack": Command("facediff.cli.data:pack", "pack a corpus, for object storage and small disks", "packed"),
     "data unpack": Command("facediff.cli.data:unpack", "write the corpus folder that a packed corpus holds", "packed"),
     "data regions": Command("facediff.cli.data:regions", "draw a corpus's lips and upper face on its mesh"),
+    "data track": Command(
+        "facediff.cli.track:track", "make a corpus of people from their videos", "prepare,render,onnx"
+    ),
     "data import-take": Command(
         "facediff.cli.data:import_take", "make a recording of Live Link Face a corpus entry", "prepare"
     ),
@@ -128,7 +132,7 @@ GROUPS = {
     "style": "speaking styles of trained models",
     "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
     "study": "user studies: make, serve, report",
-    "data": "prepare, check and pack corpora, import a reconstructed video",
+    "data": "track faces in videos; prepare, check and pack corpora",
 }
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from facediff.data.parametric import Beat as Beat
     from facediff.data.parametric import FlameClips as FlameClips
     from facediff.data.parametric import LiveLink as LiveLink
+    from facediff.data.people import People as People
     from facediff.data.puppet import Puppet as Puppet
     from facediff.data.puppet import PuppetMask as PuppetMask
     from facediff.data.vocaset import Vocaset as Vocaset
@@ -31,6 +32,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "datamodule": "SpeechMotionDataModule",
         "mead3d": "Mead3D",
         "parametric": "Beat FlameClips LiveLink",
+        "people": "People",
         "puppet": "Puppet PuppetMask",
         "vocaset": "Vocaset",
     },

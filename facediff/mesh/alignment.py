@@ -78,7 +78,7 @@ def align(
         (3.0, array([1., 1., 1.]))
     """
     source, target, weights = _checked(source, target, weights)
-    rotation, translation, factor = _fit(source[None], target, weights[None], scale)
+    rotation, translation, factor = fit_similarities(source[None], target, weights[None], scale)
     return Similarity(rotation[0], translation[0], float(factor[0]))
 
 
@@ -127,7 +127,7 @@ def robust_fit(
         spread = np.maximum(np.median(residual, axis=-1, keepdims=True) / MEDIAN_TO_SCALE, DEGENERATE * size)
         # Tukey's biweight, (1 − (r / cσ)²)²: points beyond c standard deviations lose all influence.
         robust = np.square(np.clip(1.0 - np.square(residual / (TUKEY * spread)), 0.0, None))
-        rotation, translation, factor = _fit(source, target, base * robust, scale)
+        rotation, translation, factor = fit_similarities(source, target, base * robust, scale)
         # The scale is not compared: where points lie off the origin, it cannot change without the translation.
         shift = np.abs(translation - before[1]).max() / max(size, DEGENERATE)
         if max(np.abs(rotation - before[0]).max(), shift) < TOLERANCE:
@@ -148,12 +148,12 @@ def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Arra
     random = np.random.default_rng(0)  # equal meshes are aligned by the same bits in every run and on every worker
     judges = random.permutation(len(target))[:JUDGES]
     judged, goal = source[:, judges], target[judges]
-    best = _fit(source, target, np.broadcast_to(base, source.shape[:2]), scale)
+    best = fit_similarities(source, target, np.broadcast_to(base, source.shape[:2]), scale)
     least = np.median(_residuals(judged, goal, *best), axis=-1)
     # Three points determine a rotation without a remainder: weights would change nothing.
     alike = np.ones((len(source), 3))
     for triple in random.integers(len(target), size=(TRIALS, 3)):
-        trial = _fit(source[:, triple], target[triple], alike, scale, check=False)
+        trial = fit_similarities(source[:, triple], target[triple], alike, scale, check=False)
         median = np.median(_residuals(judged, goal, *trial), axis=-1)
         better = median < least
         least = np.where(better, median, least)
@@ -163,10 +163,10 @@ def _start(source: Array, target: Array, base: Array, scale: bool) -> tuple[Arra
     return best
 
 
-def _fit(
+def fit_similarities(
     source: Array, target: Array, weights: Array, scale: bool, *, check: bool = True
 ) -> tuple[Array, Array, Array]:
-    """Weighted least squares of sources (B, N, 3) to a target (N, 3) with weights (B, N)."""
+    """Rotations (B, 3, 3), translations (B, 3), scales (B,) of sources (B, N, 3) to a target (N, 3), weights (B, N)."""
     total = weights.sum(axis=-1, keepdims=True)
     share = (weights / total)[:, None, :]
     centre, goal = share @ source, share @ target

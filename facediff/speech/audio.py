@@ -38,7 +38,10 @@ if TYPE_CHECKING:
     )
 
 SUFFIXES = (".wav", ".flac", ".ogg", ".mp3", ".opus", ".aiff")
-CONTAINERS = (".flv", ".m4a", ".mp4", ".mov", ".mkv", ".webm", ".avi", ".aac")
+CONTAINERS = (
+    *(".flv", ".m4a", ".mp4", ".mov", ".mkv", ".webm", ".avi", ".aac"),
+    *(".mpg", ".mpeg", ".m4v", ".ts", ".mts", ".wmv", ".3gp"),
+)
 """Videos and similar containers, whose sound PyAV extracts."""
 
 DEMUXERS = "flv,mov,mp4,m4a,matroska,webm,avi,aac,mpegts,mpeg,mp3,ogg,wav,flac,aiff,w64,caf"

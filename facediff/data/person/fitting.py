@@ -31,6 +31,7 @@ STILL = 1e-6  # of the face's size: slower motion counts as none
 SAME_SIZE = 1.1  # template and motion must agree in size to this factor
 SMOOTHING = 0.2  # seconds over which loudness is averaged
 NEUTRAL_SHARE = 0.05  # share of the frames that the neutral face is the median of
+CLOSED_SHARE = 1 / 3  # of the frames with closed lips
 NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
 
 
@@ -307,12 +308,22 @@ def loudness(speech: Speech, frames: int, frame_rate: float, smoothing: float = 
     return np.sqrt((energy[high] - energy[low]) / np.maximum(high - low, 1))
 
 
-def neutral_frames(loud: Array, speed: Array) -> npt.NDArray[np.int64]:
-    """The twentieth of the frames in which speech is quiet and the face is still, both; sorted indices.
+def neutral_frames(loud: Array, speed: Array, gaps: Array | None = None, closed: float = 0.0) -> Indices:
+    """Frames in which speech is quiet and the face is still, both; sorted indices.
 
-    Frames are ranked by loudness and by speed; the frames with the lowest maximum of both ranks are chosen.
+    Frames are ranked by loudness and by speed; those with the lowest maximum of both ranks are chosen: a twentieth of
+    all or, where the gap between the lips is known, a third of those in which it is smallest. People breathe through an
+    open mouth in pauses, so that quiet frames alone would give an open mouth.
+
+    Args:
+        loud: loudness of the speech (T,).
+        speed: of the face (T,).
+        gaps: between the inner lips (T,).
+        closed: gap of closed lips; frames with a larger one count only among the smallest tenth.
     """
-    worse = np.maximum(*(np.searchsorted(np.sort(values), values) for values in (loud, speed)))
+    frames = np.arange(len(loud)) if gaps is None else np.flatnonzero(gaps <= max(closed, np.quantile(gaps, 0.1)))
+    worse = np.maximum(*(np.searchsorted(np.sort(values), values) for values in (loud[frames], speed[frames])))
     least, most = NEUTRAL_FRAMES
-    count = min(len(loud), max(least, min(most, round(NEUTRAL_SHARE * len(loud)))))
-    return np.sort(np.argsort(worse, kind="stable")[:count])
+    share = NEUTRAL_SHARE if gaps is None else CLOSED_SHARE
+    count = min(len(frames), max(least, min(most, round(share * len(frames)))))
+    return np.sort(frames[np.argsort(worse, kind="stable")[:count]])

@@ -1,0 +1,173 @@
+"""``facediff data track`` and ``facediff person``: from videos of people to a corpus, and to a model of one of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from facediff.cli.data import WorkOptions, resumable
+from facediff.cli.options import CheckpointFile, OutputFolder
+from facediff.cli.process import tell
+from facediff.data.track.options import TrackingOptions
+from facediff.errors import FaceDiffError
+from facediff.utils import SAMPLE_RATE, ranges
+from facediff.utils.option import Option
+
+if TYPE_CHECKING:
+    from facediff.data.track.corpus import TrackingReport
+    from facediff.data.track.recording import Recording
+    from facediff.data.track.video import Picture
+
+Videos = Annotated[Path, Option(metavar="VIDEOS", reads=True, exists="file or folder")]
+Name = Annotated[str | None, Option(metavar="NAME")]
+CONFIG = "configs/experiment/people.yaml"
+STEPS = 400
+"""Of training by ``facediff person``."""
+PREVIEW_RATE, CURVES = 25, 96
+"""Frames a second, and height of the curves in pixels."""
+
+
+def track(
+    videos: Videos,
+    *,
+    output: OutputFolder,
+    name: Name = None,
+    preview: Annotated[Path | None, Option(metavar="MP4", writes="file", suffixes=(".mp4", ".webm"))] = None,
+    tracking: TrackingOptions,
+    work: WorkOptions,
+) -> int:
+    """Track people's faces in videos, and write them as a corpus, or add them to one.
+
+    Only track people who have agreed to it. Hidden lips, brows and vertical gaze cannot be measured: a mouth behind a
+    hand or a microphone is invented.
+
+    Args:
+        videos: a video; a folder with videos of one person; or a folder with a folder of videos for each person, whose
+            names are the folders'
+        output: folder to make, to continue or to add to
+        name: the person's name: letters, digits, dashes (default: that of the file or folder)
+        preview: video to write: the first video with the points of the face, and curves of lips and lids
+        tracking: how faces are tracked.
+        work: where the work is done
+
+    Returns:
+        0 if all videos were used, 1 if some could not.
+    """
+    from facediff.data.track.corpus import find_videos, track_people
+
+    found = find_videos(videos, name)
+    with resumable(output):
+        report = track_people(
+            found,
+            output,
+            tracking,
+            workers=work.workers,
+            scheduler=work.scheduler,
+            progress=not work.quiet,
+        )
+    tell(*lines_of(report))
+    if preview is not None:
+        write_preview(report.first, preview)
+        tell(f"{preview}: look whether the points follow lips and lids")
+    tell(f"Next: facediff data check {output}")
+    return 1 if report.failed else 0
+
+
+def lines_of(report: TrackingReport) -> Iterator[str]:
+    """The report, line by line."""
+    for person in report.people:
+        yield from person.lines()
+    for problem in report.failed.values():
+        yield f"not used: {problem}"
+
+
+def person(
+    video: Annotated[Path, Option(metavar="VIDEO", reads=True, exists="file or folder")],
+    *,
+    name: Name = None,
+    output: CheckpointFile,
+    corpus: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
+    steps: Annotated[ranges.Steps, Option(metavar="N")] = STEPS,
+    tracking: TrackingOptions,
+    quiet: bool = False,
+) -> None:
+    """Make a model of a person from a video: track the face, check the corpus, and train on it.
+
+    Only of people who have agreed to it. A minute of video is enough to begin with, ten are better; on two processor
+    cores it takes about ten minutes. The same command continues where it was stopped.
+
+    Args:
+        video: a video of the person, or a folder of videos
+        name: the person's name: letters, digits, dashes (default: that of the file or folder)
+        output: checkpoint to write (.ckpt)
+        corpus: folder of the corpus that is made on the way (default: that of the checkpoint's name)
+        steps: training steps
+        tracking: how faces are tracked.
+        quiet: no progress bars
+    """
+    from facediff.callbacks.runs import LAST
+    from facediff.cli.lightning import run_cli
+    from facediff.data import People
+    from facediff.data.check import check
+    from facediff.data.track.corpus import find_videos, track_people
+
+    started, root = time.monotonic(), corpus or output.with_suffix("")
+    videos = find_videos(video, name)
+    if len(videos) > 1:
+        raise FaceDiffError(f"{video}: holds several people's videos; expected one's, or use `facediff data track`")
+    with resumable(output):
+        tracked = track_people(videos, root, tracking, workers=None, progress=not quiet)
+        tell(*lines_of(tracked))
+        if not check(root, None, progress=not quiet).sound:
+            raise FaceDiffError(f"{root}: is not sound; `facediff data check {root}` says why")
+        data = People(root=str(root))
+        options = ["--config", CONFIG, f"--data.root={root}", f"--trainer.max_steps={steps}"]
+        options += [f"--trainer.logger.save_dir={root}", "--trainer.logger.name=.training"]
+        options += [] if data.clips("val") else ["--trainer.limit_val_batches=0"]
+        options += ["--ckpt_path", "last"] if any((root / ".training").glob(f"*/{LAST}")) else []
+        trained = run_cli("fit", options)
+    trained.trainer.save_checkpoint(output)
+    (who,) = videos
+    words = f"--checkpoint {output} --identity {who}"
+    tell(
+        f"{output}: {who}, in {(time.monotonic() - started) / 60:.0f} min",
+        f"Next: facediff animate speech.wav {words} -o speech.mp4",
+        f"      facediff animate speech.wav {words} --target-mesh avatar.glb -o speech.glb",
+    )
+
+
+def write_preview(recording: Recording, path: Path) -> None:
+    """Write a video with the points of its face, and below it curves of lips (red) and lids (blue)."""
+    from facediff.render import write_video
+
+    write_video(path, preview_frames(recording), PREVIEW_RATE, recording.speech, SAMPLE_RATE)
+
+
+def preview_frames(recording: Recording) -> Iterator[Picture]:
+    """The pictures of a video at a constant rate, with points and curves."""
+    import cv2
+    import numpy as np
+
+    from facediff.data.track.face import pair_distances
+    from facediff.data.track.topology import EYELID_PAIRS, LIP_PAIRS
+    from facediff.data.track.video import read_pictures
+
+    landmarks, times = recording.landmarks, recording.times
+    widths = np.linalg.norm(landmarks[:, 234] - landmarks[:, 454], axis=-1)
+    curves = [pair_distances(landmarks, pairs) / widths for pairs in (LIP_PAIRS, EYELID_PAIRS)]
+    written = 0
+    for number, (_, picture) in enumerate(read_pictures(recording.source)):
+        canvas = np.concatenate([picture, np.zeros((CURVES, picture.shape[1], 3), np.uint8)])
+        for x, y in landmarks[number, :, :2] if np.isfinite(recording.presence[number]) else ():
+            cv2.circle(canvas, (round(float(x)), round(float(y))), 1, (0, 255, 0), -1)
+        for curve, colour in zip(curves, ((255, 80, 80), (80, 160, 255)), strict=True):
+            shown = curve[max(0, number - picture.shape[1] // 2) : number + 1]
+            heights = canvas.shape[0] - 2 - (CURVES - 4) * shown / max(float(np.nanmax(curve)), 1e-6)
+            line = np.stack([2 * np.arange(len(shown)), heights], axis=1)[np.isfinite(heights)]
+            cv2.polylines(canvas, [line.round().astype(np.int32)], False, colour, 1, cv2.LINE_AA)
+        end = times[number + 1] if number + 1 < len(times) else times[number] + 1 / PREVIEW_RATE
+        while written < end * PREVIEW_RATE - 1e-6:
+            written += 1
+            yield canvas

@@ -1,0 +1,220 @@
+"""One video: its landmarks, times and sound as files, and the parts in which its face can be used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.data.track.face import MILLIMETRES, PosedFaces, pair_distances, pose
+from facediff.data.track.model import FaceModel, read_face_model
+from facediff.data.track.tracker import FaceTracker
+from facediff.data.track.video import Picture, read_pictures
+from facediff.errors import FaceDiffError
+from facediff.speech.audio import read_speech
+from facediff.utils.batch import FileTask
+from facediff.utils.files import atomic
+from facediff.utils.jobs import PerWorker
+
+Array = npt.NDArray[np.float64]
+
+LANDMARKS = 478
+BLOCK = 256  # frames that are posed at a time
+SILENCE = 1e-4  # of a sample: below it a recording is silent
+MOST_MISSED = 0.2  # share of frames without a face
+MOST_TURNED, TURNED = 0.1, 35.0  # share of frames, degrees
+OTHERS_SEEN = 0.2  # share of the checks that may show a second face
+LONGEST_GAP = 0.2  # seconds that are interpolated
+SCALE_JUMP, CENTRE_JUMP, SHAPE_JUMP = 0.06, 0.5, 2.5
+"""Steps from frame to frame at which the video is cut: of the face's scale, of its centre in widths of a face, and of
+the face without lips in millimetres, which is another person."""
+FACE_WIDTH = 150.0  # millimetres
+MIN_SECONDS = 2.0
+STILL_POINTS = (6, 168, 197, 195, 5, 4, 33, 133, 362, 263, 127, 356, 234, 454, 10, 151)
+"""Points of the nose, the corners of the eyes and the outline above the mouth."""
+
+
+@dataclass(frozen=True)
+class FaceChoice:
+    """Which face of a video is tracked, and by which model.
+
+    Attributes:
+        model: ``face_landmarker.task``.
+        face: ``largest``, ``left``, or a number from the left, from 1; None where there should be one.
+        smallest: pixels of the smallest face.
+    """
+
+    model: Path | None
+    face: str | None = None
+    smallest: float = 50.0
+
+
+def video_tracker(choice: FaceChoice) -> PerWorker[FileTask, list[Path]]:
+    """What tracks a video and writes its files; each worker loads the model once."""
+    return PerWorker(partial(_load, choice))
+
+
+def _load(choice: FaceChoice) -> Any:  # noqa: ANN401 - a partial
+    return partial(_track, read_face_model(choice.model), choice)
+
+
+def landmark_file(output: Path) -> Path:
+    """The file of landmarks that belongs to a file of times, presence and sound."""
+    return output.with_suffix(".npy")
+
+
+def _track(model: FaceModel, choice: FaceChoice, task: FileTask) -> list[Path]:
+    """Write the landmarks of a video, frame by frame, then times, presence, sound and counts."""
+    speech = read_speech(task.source)
+    if float(np.abs(speech).max()) < SILENCE:
+        raise FaceDiffError(f"{task.source}: holds only silence; expected a video of a person who speaks")
+    face = {None: "largest", "left": "1"}.get(choice.face, choice.face) or "largest"
+    tracker = FaceTracker(model, face, choice.smallest)
+    times: list[float] = []
+    presence: list[float] = []
+    checks, others, repeated = 0, 0, 0
+    last: Picture | None = None
+    target = landmark_file(task.output)
+    with atomic(target) as temporary, temporary.open("wb") as stream:
+        write_header(stream, 0)
+        for time, picture in read_pictures(task.source):
+            if not times or time >= times[0] + checks:  # once a second
+                checks, others = checks + 1, others + (len(tracker.faces(picture)) > 1)
+            sample = picture[::8, ::8]
+            repeated += last is not None and sample.shape == last.shape and np.array_equal(sample, last)
+            last = sample
+            landmarks, logit = tracker.landmarks(picture) or (np.full((LANDMARKS, 3), np.nan), math.nan)
+            stream.write(landmarks.astype("<f4").tobytes())
+            times.append(time)
+            presence.append(logit)
+        stream.seek(0)
+        write_header(stream, len(times))
+    if choice.face is None and others > OTHERS_SEEN * checks:
+        raise FaceDiffError(
+            f"{task.source}: shows several faces; say which with --face largest, left, or its number from the left"
+        )
+    arrays = {"times": np.array(times), "presence": np.array(presence), "speech": speech, "repeated": repeated}
+    with atomic(task.output) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, **arrays)
+    return [task.output, target]
+
+
+def write_header(stream: IO[bytes], frames: int) -> None:
+    """The header of a .npy file of landmarks; NumPy leaves room in it for a larger number of frames."""
+    header = {"descr": "<f4", "fortran_order": False, "shape": (frames, LANDMARKS, 3)}
+    np.lib.format.write_array_header_1_0(stream, header)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A video that was tracked.
+
+    Attributes:
+        source: the video.
+        landmarks: (T, 478, 3) in pixels, NaN where no face was seen; in a file.
+        times: (T,) seconds from the first frame.
+        presence: (T,) logit of a face, NaN where none was seen.
+        speech: (S,) at 16 kHz, from the first frame on.
+        repeated: frames that show the picture before them.
+    """
+
+    source: Path
+    landmarks: npt.NDArray[np.float32]
+    times: Array
+    presence: Array
+    speech: npt.NDArray[np.float32]
+    repeated: int
+
+    @classmethod
+    def open(cls, task: FileTask) -> Recording:
+        """The files of :func:`video_tracker`."""
+        landmarks = np.load(landmark_file(task.output), mmap_mode="r")
+        with np.load(task.output) as arrays:
+            times = arrays["times"] - arrays["times"][0] if len(landmarks) else arrays["times"]
+            return cls(task.source, landmarks, times, arrays["presence"], arrays["speech"], int(arrays["repeated"]))
+
+    @property
+    def frame_rate(self) -> float:
+        """Frames a second, on average."""
+        return (len(self.times) - 1) / max(float(self.times[-1]), 1e-6)
+
+    @property
+    def missed(self) -> int:
+        """Frames without a face."""
+        return int(np.isnan(self.presence).sum())
+
+    def posed(self, model: FaceModel) -> Iterator[PosedFaces]:
+        """The faces laid onto the canonical face, in blocks of frames."""
+        for first in range(0, len(self.landmarks), BLOCK):
+            yield pose(self.landmarks[first : first + BLOCK], MILLIMETRES * model.canonical, model.weights)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingSummary:
+    """What the frames of a recording say as a whole.
+
+    Attributes:
+        parts: first frame, and frame after the last, of the parts without cuts and long gaps.
+        face_pixels: median width of the face.
+        gaps: (T,) between the lips in millimetres; NaN where no face was seen.
+        sample: (N, 478, 3) landmarks of frames evenly spread over the parts.
+    """
+
+    parts: list[tuple[int, int]]
+    face_pixels: float
+    gaps: Array
+    sample: npt.NDArray[np.float32]
+
+
+def summarise(recording: Recording, model: FaceModel, most: int) -> RecordingSummary:
+    """Find the usable parts of a recording; a video that cannot be used is refused.
+
+    Args:
+        recording: the video.
+        model: the canonical face.
+        most: frames of the sample.
+    """
+    count, source = len(recording.times), recording.source
+    if count < 2 or recording.missed > MOST_MISSED * count:
+        raise FaceDiffError(
+            f"{source}: shows no face in {recording.missed} of {count} frames; expected a face in at least 80 % of "
+            f"them, of 50 pixels or --min-face, seen from the front"
+        )
+    blocks = list(recording.posed(model))
+    scales, centres, angles = (
+        np.concatenate([getattr(block, name) for block in blocks]) for name in ("scales", "centres", "angles")
+    )
+    turned = np.nanmean(np.abs(angles[:, :2]).max(axis=1) > TURNED)
+    if turned > MOST_TURNED:
+        raise FaceDiffError(
+            f"{source}: the head is turned by more than {TURNED:g}° in {turned:.0%} of the frames; expected a face "
+            f"that looks towards the camera"
+        )
+    gaps = np.concatenate([pair_distances(block.faces) for block in blocks])
+    still = np.concatenate([block.faces[:, STILL_POINTS] for block in blocks])
+    seen = np.flatnonzero(np.isfinite(scales))
+    steps = np.diff(seen)
+    widths = FACE_WIDTH * scales[seen]
+    with np.errstate(invalid="ignore"):
+        breaks = (
+            (np.diff(recording.times[seen]) > LONGEST_GAP + 1 / recording.frame_rate)
+            | (np.abs(np.diff(np.log(scales[seen]))) > SCALE_JUMP * steps)
+            | (np.linalg.norm(np.diff(centres[seen], axis=0), axis=1) > CENTRE_JUMP * widths[1:] * steps)
+            | (np.sqrt(np.square(np.diff(still[seen], axis=0)).sum(-1).mean(-1)) > SHAPE_JUMP * steps)
+        )
+    starts = [0, *(np.flatnonzero(breaks) + 1)]
+    parts = [(int(seen[a]), int(seen[b - 1]) + 1) for a, b in zip(starts, [*starts[1:], len(seen)], strict=True)]
+    parts = [(a, b) for a, b in parts if recording.times[b - 1] - recording.times[a] >= MIN_SECONDS]
+    if not parts:
+        raise FaceDiffError(
+            f"{source}: has no {MIN_SECONDS:g} s of one face without a cut; expected a video of a person who speaks"
+        )
+    usable = np.concatenate([seen[(seen >= a) & (seen < b)] for a, b in parts])
+    chosen = usable[np.linspace(0, len(usable) - 1, min(most, len(usable))).astype(int)]
+    return RecordingSummary(parts, float(np.median(widths)), gaps, np.asarray(recording.landmarks[chosen]))
