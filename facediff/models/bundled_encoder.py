@@ -1,4 +1,4 @@
-"""The audio encoder of the model that comes with facediff, as a start for models of little data."""
+"""The audio encoder of the model that comes with facediff, as a start for models of few people."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ HALF = 10  # ONNX's number of the type
 
 @audio_encoder.register("bundled")
 class BundledEncoder(MelEncoder):
-    """The encoder of the bundled model, frozen, and two convolutions that are trained.
+    """The encoder of the bundled model, and two convolutions after it.
 
-    It has heard 109 voices, in noise and in rooms. On strangers' voices, a model of one real person is more accurate
-    with it than with an encoder that has heard that person alone.
+    It has heard 109 voices, in noise and in rooms, so that a model of one person keeps up with other voices.
 
     Args:
         dim: channels of the result; given by the model.
+        frozen: train the convolutions only, and leave the encoder as it is.
         dropout: dropout in the convolutions.
     """
 
-    def __init__(self, *, dim: Width, dropout: Share = 0.0) -> None:
+    def __init__(self, *, dim: Width, frozen: bool = True, dropout: Share = 0.0) -> None:
         super().__init__(dim=128, hidden_dim=128, num_layers=4, dropout=0.0)
         self.load_state_dict(graph_weights(BUNDLED / GRAPH))
-        self.requires_grad_(False)
+        self.requires_grad_(not frozen)
         self.trained = nn.ModuleList(ConvBlock(128, dilation, dropout) for dilation in (1, 2))
         self.widen = nn.Sequential(nn.LayerNorm(128), nn.Linear(128, dim))
 

@@ -53,6 +53,9 @@ LOUDEST = 2.0**31
 BLOCK = 1 << 18
 """Samples of all channels together that are decoded at a time."""
 
+HOLE = 0.05
+"""Seconds of sound that may be missing between two packets of a video before they count as lost."""
+
 UNKNOWN = 1 << 62
 """libsndfile gives a length above this where a stream does not tell it."""
 
@@ -209,11 +212,18 @@ def _decode_container(path: Path, most: float | None) -> tuple[npt.NDArray[np.fl
             if track.duration and track.time_base:
                 _check_length(path, float(track.duration * track.time_base), most)
             plain = AudioResampler(format="fltp", layout="mono", rate=rate)
-            decoded, late = 0, None
+            decoded, late, start, heard = 0, None, None, 0
             for frame in chain(container.decode(audio=0), [None]):  # at None, what the resampler still holds comes out
                 if late is None and frame is not None:
-                    late = round(_seconds_after_picture(container, frame.time) * rate)
+                    late, start = round(_seconds_after_picture(container, frame.time) * rate), frame.time
                     decoded += max(0, late)
+                if frame is not None and start is not None and frame.time is not None:
+                    hole = round((frame.time - start) * rate) - heard
+                    if hole > HOLE * rate:  # packets were lost: what follows stays in step with the pictures
+                        _check_length(path, (decoded + hole) / rate, most)
+                        parts.append(np.zeros(hole, np.float32))
+                        decoded, heard = decoded + hole, heard + hole
+                    heard += frame.samples
                 for part in plain.resample(frame):
                     parts.append(part.to_ndarray()[0])
                     decoded += len(parts[-1])

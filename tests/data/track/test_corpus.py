@@ -1,0 +1,185 @@
+"""From videos to a corpus of people, with faces that are coded in the pictures instead of tracked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.cli.app import main
+from facediff.data import People
+from facediff.data.corpus import read_clip_table, read_templates
+from facediff.data.track.topology import LIP_PAIRS
+from facediff.mesh.files import read_mesh
+from tests.fakes.people import Look, talking, use_coded_faces, write_coded_video, write_people
+
+
+@pytest.fixture(autouse=True)
+def coded_faces(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_coded_faces(monkeypatch)
+
+
+def pictures(looks: list[Look]) -> list[np.ndarray]:
+    return [look.picture() for look in looks]
+
+
+def track(source: Path, out: Path, *options: str) -> int:
+    return main(["data", "track", str(source), "-o", str(out), "--workers", "1", "--quiet", *options])
+
+
+def gaps_of(root: Path, clip: str) -> np.ndarray:
+    faces = np.load(root / "vertices_npy" / f"{clip}.npy").reshape(-1, 468, 3)
+    upper, lower = np.array(LIP_PAIRS).T
+    return np.linalg.norm(faces[:, upper] - faces[:, lower], axis=-1).mean(axis=1)
+
+
+def test_a_video_becomes_a_sound_corpus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    looks = talking(20, yaw=10.0)
+    video = write_coded_video(tmp_path / "maria.mp4", pictures(looks))
+    out = tmp_path / "people"
+    assert track(video, out, "--clip-seconds", "4", "--licence", "CC-BY-4.0") == 0
+    rows = read_clip_table(out)
+    assert list(rows) == [f"maria_s{number:03d}" for number in range(1, 6)]
+    assert [row["split"] for row in rows.values()] == ["train", "train", "train", "val", "test"]
+    truth = np.array([look.gap for look in looks]) * 0.01  # centimetres of the canonical face
+    measured = np.concatenate([gaps_of(out, clip) for clip in rows])
+    assert len(measured) == len(truth)
+    assert np.corrcoef(truth, measured)[0, 1] > 0.995  # no lag
+    assert np.abs(truth - measured).mean() < 2e-4
+    head = np.load(out / "head_npy" / "maria_s001.npy")
+    np.testing.assert_allclose(head.mean(axis=0), [0, 10, 0], atol=0.5)
+    np.testing.assert_allclose(np.load(out / "gaze_npy" / "maria_s001.npy"), 0, atol=0.5)
+    template = read_templates(out / "templates.pkl")["maria"].numpy()
+    assert np.linalg.norm(template[13] - template[14]) < 1e-3  # though the mouth is open in half of the frames
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["licence"]["commercial"] == "allowed"
+    assert len(read_mesh(out / "people.ply").vertices) == 468
+    capsys.readouterr()
+    assert main(["data", "check", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["findings"] == []
+
+
+def test_uneven_times_give_even_frames(tmp_path: Path) -> None:
+    times = np.cumsum(np.random.default_rng(0).choice([0.033, 0.067], 200))
+    gaps = 0.45 + 0.4 * np.sin(2 * np.pi * 0.8 * times)
+    video = write_coded_video(tmp_path / "eva.mp4", pictures([Look(float(gap)) for gap in gaps]), times=times)
+    assert track(video, tmp_path / "people", "--clip-seconds", "60", "--smoothing", "none") == 0
+    measured = gaps_of(tmp_path / "people", "eva_s001")
+    grid = times[0] + np.arange(len(measured)) / 25
+    assert abs(len(measured) / 25 - (times[-1] - times[0])) < 0.08
+    assert np.abs(measured - 0.01 * np.interp(grid, times, gaps)).max() < 4e-4
+
+
+def test_sound_that_begins_late_stays_in_step(tmp_path: Path) -> None:
+    click = np.zeros(64_000, np.float32)
+    click[16_000:16_400] = 0.8  # one second after the sound's beginning
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(5)), sound=click, sound_start=0.4)
+    assert track(video, tmp_path / "people", "--clip-seconds", "60") == 0
+    import soundfile
+
+    speech = soundfile.read(tmp_path / "people" / "wav" / "eva_s001.wav")[0]
+    assert abs(int(np.abs(speech).argmax()) / 16_000 - 1.4) < 0.04
+
+
+@pytest.mark.parametrize(
+    ("between", "clips"),
+    [
+        ([], 1),
+        ([Look(faces=0)] * 4, 1),  # 0.16 s are interpolated
+        ([Look(faces=0)] * 12, 2),
+        ([Look(scale=0.6)], 2),  # a jump to a larger face, and back
+    ],
+)
+def test_cuts_and_long_gaps_part_clips(tmp_path: Path, between: list[Look], clips: int) -> None:
+    video = write_coded_video(tmp_path / "eva.mp4", pictures([*talking(4), *between, *talking(4, seed=1)]))
+    assert track(video, tmp_path / "people", "--clip-seconds", "60") == 0
+    rows = read_clip_table(tmp_path / "people")
+    assert len(rows) == clips
+    if len(between) == 4:
+        confidence = np.load(tmp_path / "people" / "confidence_npy" / "eva_s001.npy")
+        assert np.isnan(confidence).sum() == int(rows["eva_s001"]["missed"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("looks", "options", "problem"),
+    [
+        ([Look(faces=0)] * 100, {}, "shows no face in 100 of 100 frames"),
+        (talking(4, faces=2), {}, "shows several faces; say which with --face"),
+        (talking(4, yaw=40), {}, "turned by more than 35°"),
+        (talking(1), {}, "has no 2 s of one face"),
+        (talking(4), {"audible": False}, "has no sound track"),
+        (talking(4), {"sound": np.zeros(64_000, np.float32)}, "holds only silence"),
+    ],
+)
+def test_videos_that_cannot_be_used(
+    tmp_path: Path, looks: list[Look], options: dict[str, object], problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(looks), **options)  # type: ignore[arg-type]
+    assert track(video, tmp_path / "people") == 2
+    assert problem in capsys.readouterr().err
+
+
+def test_one_of_several_faces_is_chosen(tmp_path: Path) -> None:
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(4, faces=2)))
+    assert track(video, tmp_path / "people", "--face", "left") == 0
+
+
+def test_what_is_no_video_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "eva.mp4").write_bytes(b"no video at all" * 100)
+    assert track(tmp_path / "eva.mp4", tmp_path / "people") == 2
+    assert "eva.mp4" in capsys.readouterr().err
+
+
+def test_people_are_added_and_a_bad_video_stops_no_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    videos = write_people(tmp_path / "videos", {"ada": [talking(3), talking(3, seed=1)], "ben": [talking(3)]})
+    write_coded_video(videos / "ben" / "dark.mp4", pictures([Look(faces=0)] * 80))
+    out = tmp_path / "people"
+    assert track(videos, out) == 1
+    assert "not used" in capsys.readouterr().out
+    first = (out / "vertices_npy" / "ada_s001.npy").stat().st_mtime_ns
+    write_people(tmp_path / "more", {"cleo": [talking(3)]})
+    assert track(tmp_path / "more", out) == 0
+    assert {row["subject"] for row in read_clip_table(out).values()} == {"ada", "ben", "cleo"}
+    assert (out / "vertices_npy" / "ada_s001.npy").stat().st_mtime_ns == first
+    assert sorted(read_templates(out / "templates.pkl")) == ["ada", "ben", "cleo"]
+    assert track(tmp_path / "more", out, "--scale", "iris") == 2
+    assert "was begun with other settings" in capsys.readouterr().err
+
+
+def test_tracks_are_kept_for_the_next_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    videos = write_people(tmp_path / "videos", {"ada": [talking(3), talking(3, seed=1)]})
+    out = tmp_path / "people"
+    assert track(videos / "ada", out) == 0
+    before = {path: path.read_bytes() for path in (out / "vertices_npy").iterdir()}
+    (out / "track.json").write_text(json.dumps(json.loads((out / "manifest.json").read_text())["options"]))
+    (out / "manifest.json").unlink()  # as a run leaves it that was stopped while it wrote
+    monkeypatch.setattr("facediff.data.track.recording.FaceTracker", None)
+    assert track(videos / "ada", out) == 0
+    assert {path: path.read_bytes() for path in (out / "vertices_npy").iterdir()} == before
+
+
+def test_irises_can_set_the_scale(tmp_path: Path) -> None:
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(3)))
+    assert track(video, tmp_path / "one") == 0
+    assert track(video, tmp_path / "other", "--scale", "iris") == 0
+    one, other = (np.load(tmp_path / name / "vertices_npy" / "eva_s001.npy") for name in ("one", "other"))
+    np.testing.assert_allclose(other, one * 11.7 / 12.0, rtol=2e-3)
+
+
+def test_splits_of_one_person_and_of_many(tmp_path: Path) -> None:
+    names = ["ada", "ben", "cleo", "dan", "eve"]
+    out = tmp_path / "people"
+    write_people(tmp_path / "videos", {name: [talking(2.4, seed=i) for i in range(4)] for name in names})
+    write_people(tmp_path / "videos", {"fay": [talking(2.4)]})
+    assert track(tmp_path / "videos", out) == 0
+    data = People(root=str(out), test_people=0.34)
+    unseen = sorted({*names, "fay"} - {*data.identities})
+    assert len(unseen) == 2
+    assert {clip.identity for clip in data.clips("train")} == {*data.identities} - {"fay"}
+    by_split = {split: {clip.identity for clip in data.clips(split)} for split in ("val", "test_a", "test_b")}
+    assert by_split["val"] == by_split["test_a"] == {*data.identities} - {"fay"}
+    assert by_split["test_b"] == {*unseen} - {"fay"}
+    assert all(data.find_split(clip) is None for clip in data.corpus.clips.values() if clip.identity == "fay")
+    assert People(root=str(out), extra_identities=["ada"]).identities == ["ada"]
