@@ -72,6 +72,25 @@ No list was found for BIWI (23370 vertices), and Multiface's authors say that th
 (github.com/facebookresearch/multiface, issue 21): :func:`landmarks_by_shape` finds some of theirs.
 """
 
+CANONICAL_VERTICES = 468
+CANONICAL: dict[str, int] = {
+    "nose_tip": 1,
+    "chin": 152,
+    "mouth_corner_left": 291,
+    "mouth_corner_right": 61,
+    "eye_outer_left": 263,
+    "eye_outer_right": 33,
+    "eye_inner_left": 362,
+    "eye_inner_right": 133,
+    "nose_bridge": 168,
+    "nose_base": 2,
+    "upper_lip_top": 0,
+    "lower_lip_bottom": 17,
+    "upper_lip_middle": 13,
+    "lower_lip_middle": 14,
+}
+"""Vertices of MediaPipe's canonical face, which the corpora of ``facediff data track`` have."""
+
 
 def puppet_landmarks() -> dict[str, int]:
     """Vertices of the built-in head.
@@ -110,7 +129,7 @@ class LandmarkTemplate:
     """The named places of a mesh.
 
     Attributes:
-        topology: puppet or FLAME; None where the places were found by the mesh's shape.
+        topology: puppet, FLAME or people; None where the places were found by the mesh's shape.
         vertices: vertex of each name, in the order of :data:`NAMES`; names that are not known are absent.
     """
 
@@ -150,6 +169,7 @@ def known_topology(vertices: npt.NDArray[np.floating]) -> LandmarkTemplate | Non
     for topology, count, table in (
         ("puppet", N_HEAD_VERTICES, puppet_landmarks),
         ("FLAME", FLAME_VERTICES, FLAME.copy),
+        ("people", CANONICAL_VERTICES, CANONICAL.copy),
     ):
         if len(points) == count and _lie_as_on_a_face(points, landmarks := table()):
             return LandmarkTemplate(topology, landmarks)

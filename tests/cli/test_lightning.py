@@ -235,7 +235,7 @@ def test_a_component_chosen_by_name_starts_from_its_own_defaults(
 EXPERIMENTS = sorted(path.name for path in (CONFIGS / "experiment").glob("*.yaml"))
 QUICK = (
     *("biwi", "mead3d", "vocaset", "biwi_faceformer", "puppet_hubert", "puppet_codetalker_prior", "puppet_mask"),
-    *("beat", "flame_clips", "live_link"),
+    *("beat", "flame_clips", "live_link", "people"),
 )
 """Those that are parsed in the quick suite: every corpus, trainer and kind of model; others differ by their sizes."""
 
