@@ -56,7 +56,7 @@ class People(SpeechMotionDataModule):
 
     corpus_name: ClassVar[str] = "people"
     unit = "m"
-    frame_rate = 25.0  # type: ignore[misc] # of an instance, that of its folder
+    frame_rate: ClassVar[float] = 25.0  # of an instance, that of its folder
     n_vertices = 468
     identities: list[str] = []  # noqa: RUF012 - of a class, as those of all corpora; those of a folder are found in it
     mesh_files: ClassVar[tuple[str, ...]] = ("people.ply",)
@@ -78,7 +78,7 @@ class People(SpeechMotionDataModule):
         seen = extra_identities or [name for name in names if name not in unseen]
         super().__init__(root=root, extra_identities=seen, batch_size=batch_size, **options)
         if folder.is_dir():
-            self.frame_rate = float(read_manifest(folder).get("frame_rate") or self.frame_rate)
+            self.frame_rate = float(read_manifest(folder).get("frame_rate") or 25)  # type: ignore[misc]
 
     @classmethod
     def check_root(cls, root: str | Path) -> None:

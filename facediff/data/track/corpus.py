@@ -241,8 +241,8 @@ class PeopleWriter:
         for recording, summary in recordings:
             for part in summary.parts:
                 for frames in self._cuts(recording, *part):
-                    clip = f"{name}_s{len(clips) + 1:03d}"
-                    clips.append(self._write(clip, recording, summary, part, frames, target, scale))
+                    clip_name = f"{name}_s{len(clips) + 1:03d}"
+                    clips.append(self._write(clip_name, recording, summary, part, frames, target, scale))
         for clip, split in zip(clips, splits(len(clips)), strict=True):
             clip.row["split"] = split
             self.rows[clip.row["clip"]] = clip.row

@@ -99,9 +99,8 @@ def _track(model: FaceModel, choice: FaceChoice, task: FileTask) -> list[Path]:
         raise FaceDiffError(
             f"{task.source}: shows several faces; say which with --face largest, left, or its number from the left"
         )
-    arrays = {"times": np.array(times), "presence": np.array(presence), "speech": speech, "repeated": repeated}
     with atomic(task.output) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, **arrays)
+        np.savez(stream, times=np.array(times), presence=np.array(presence), speech=speech, repeated=repeated)
     return [task.output, target]
 
 
