@@ -5,7 +5,7 @@ Source: Khronos Group, glTF 2.0 Specification. Metres, y up, the face looks alon
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.animation.animation import stretches_of
 from facediff.animation.options import ExportOptions
 from facediff.editing.eyes import puppet_eyes
 from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
@@ -29,6 +30,7 @@ Array = npt.NDArray[np.float32]
 BLOCK = 3000  # Coordinates that are processed together; bounds the memory for residuals
 ROUNDING = 1e-5  # Share of a face's size that single precision loses over several steps
 LINEAR = "LINEAR"  # Interpolation between keys
+LONG_BYTES = 1 << 27  # Motion that is larger is never in memory as a whole
 
 
 @export_format.register("glb")
@@ -55,8 +57,7 @@ class GlbFormat(Format):
             rest, morphs = own
             extras["tolerance_mm"] = options.tolerance
         else:
-            offsets = np.stack([frame - rest for frame in space.frames(animation)])
-            morphs = compress(offsets, options.tolerance / 1000)
+            morphs = shapes_of_motion(animation, space, rest, options.tolerance / 1000)
             extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
@@ -123,6 +124,28 @@ def weighted_shapes(animation: Animation, space: FileSpace, tolerance: float) ->
     if any(np.square(other - rest).sum(-1).max() > tolerance**2 for other in moved):
         return None
     return rest, Morphs(shapes, weights, None, names)
+
+
+def shapes_of_motion(animation: Animation, space: FileSpace, rest: Array, tolerance: float) -> Morphs:
+    """As few shapes as keep every vertex of every frame within a distance of the original, see :func:`compress`.
+
+    Args:
+        animation: with a head that does not move.
+        space: of the file.
+        rest: (V, 3) the face at rest in it.
+        tolerance: largest distance of a vertex, in the unit of the file.
+    """
+    if len(animation.vertices) * rest.nbytes > LONG_BYTES:
+        from facediff.export.glb_long import compress_long
+
+        def parts() -> Iterator[Array]:
+            for _, vertices in stretches_of(animation.vertices):
+                yield (space.place(vertices) - rest).reshape(len(vertices), -1)
+
+        if (found := compress_long(parts, tolerance)) is not None:
+            weights, shapes, components = found
+            return Morphs(shapes.reshape(-1, *rest.shape), weights, components)
+    return compress(np.stack([frame - rest for frame in space.frames(animation)]), tolerance)
 
 
 def compress(offsets: Array, tolerance: float) -> Morphs:
@@ -209,13 +232,29 @@ def normal_shapes(weights: Array, rest: Array, normals: Iterable[Array]) -> Arra
         rest: (V, 3) normals of the rest face.
         normals: the normals (V, 3) of every frame.
     """
-    inverse = np.linalg.pinv(weights.astype(np.float64), rcond=1e-2).astype(np.float32)
-    offsets = np.zeros((len(inverse), *rest.shape), np.float32)
+    inverse = pseudo_inverse(weights)
+    offsets = np.zeros((weights.shape[1], *rest.shape), np.float32)
     turned, step = iter(normals), 16
     for start in range(0, len(weights), step):
         batch = np.stack([normal - rest for normal in islice(turned, step)])
-        offsets += np.tensordot(inverse[:, start : start + step], batch, axes=1)
+        offsets += np.tensordot(inverse(slice(start, start + step)), batch, axes=1)
     return offsets
+
+
+def pseudo_inverse(weights: Array) -> Callable[[slice], Array]:
+    """Columns (M, n) of the pseudo-inverse of weights (T, M) for some of the frames, without weak directions."""
+    if weights.nbytes <= LONG_BYTES // 16:
+        inverse = np.linalg.pinv(weights.astype(np.float64), rcond=1e-2).astype(np.float32)
+        return lambda frames: inverse[:, frames]
+    # (WᵀW)⁻¹Wᵀ, whose singular values are the roots of WᵀW's: a few columns at a time take no memory.
+    gram = np.zeros((weights.shape[1], weights.shape[1]))
+    for first in range(0, len(weights), BLOCK):
+        some = weights[first : first + BLOCK].astype(np.float64)
+        gram += some.T @ some
+    squares, vectors = np.linalg.eigh(gram)
+    strong = squares > 1e-4 * squares.max()
+    left = (vectors[:, strong] / squares[strong]) @ vectors[:, strong].T
+    return lambda frames: (left @ weights[frames].T).astype(np.float32)
 
 
 def _blocks(flat: Array) -> Iterator[npt.NDArray[np.float64]]:
