@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from facediff.export.glb import compress, largest_error
-from facediff.export.glb_long import compress_long
+from facediff.export.motion_shapes import compress, compress_long, largest_error
 
 
 def motion(frames: int, rank: int) -> np.ndarray:
