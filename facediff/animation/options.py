@@ -91,10 +91,10 @@ class GenerationOptions(CheckedOptions):
     Attributes:
         identity: whose face and identity; by default the first one trained on
         condition: the training identity that the model is conditioned on, where it is not that of the face
-        style: the speaking style: a motion (.npy of absolute vertices, .npz animation; of models of channels .csv,
-            .json, or clip.npy@flame_artalk with its layout), a vector of `facediff style extract`, a clip's name
-            (F1_e03), an identity's (F1), or a mixture of them (a.npy:0.3,b.npy:0.7); by default the one that the
-            speech asks for, or else the identity's
+        style: the speaking style: a video of a person; a motion (.npy of absolute vertices, .npz animation; of models
+            of channels .csv, .json, or clip.npy@flame_artalk with its layout), a vector of `facediff style extract`, a
+            clip's name (F1_e03), an identity's (F1), or a mixture of them (a.npy:0.3,b.npy:0.7); by default the one
+            that the speech asks for, or else the identity's
         style_template: neutral face (mesh or .npy) of the speaker whose motion the style holds, where the checkpoint
             does not know them; or the word median
         sampler: sampler by name, with the checkpoint's spacing and last noise where its steps allow them; see `facediff

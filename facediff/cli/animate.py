@@ -117,6 +117,11 @@ def animate(
 
     check_used(batch.suffix if several else ".npy" if stream else output.suffix, files.changed())
     files = replace(files, quiet=quiet)
+    if isinstance(generation.style, str):
+        from facediff.cli.track import with_tracked_styles
+
+        words = with_tracked_styles(generation.style, checkpoint, generation.identity)
+        generation = replace(generation, style=words)
     options = AnimationOptions.of(
         generation, windows, recording, controls, target, place, licence, checkpoint=checkpoint, quiet=quiet
     )

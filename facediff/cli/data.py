@@ -280,11 +280,11 @@ def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions) -> None:
 def import_person(
     motion: Annotated[Path, Option(metavar="MOTION", reads=True, exists="file or folder")],
     *,
-    audio: Annotated[Path, Option(metavar="FILE", reads=True, exists="file")],
+    audio: File = None,
     name: str,
     corpus: Annotated[Path, Option(metavar="ROOT", reads=True, exists="folder")],
     output: OutputFolder,
-    frame_rate: Annotated[ranges.FrameRate, Option(metavar="F")],
+    frame_rate: FrameRate = None,
     corpus_frame_rate: FrameRate = None,
     template: File = None,
     stable: FileOrList = None,
@@ -293,19 +293,20 @@ def import_person(
     clip_seconds: Annotated[ranges.ClipLength, Option(metavar="S")] = 8.0,
     quiet: bool = False,
 ) -> None:
-    """Turn the 3D reconstruction of one person's video into a corpus entry.
+    """Turn the 3D reconstruction of one person's video, or for a corpus of people the video, into a corpus entry.
 
     Any data module takes it next to its own speakers (--data.people), and `facediff animate --style` takes a style
     from it.
 
     Args:
-        motion: folder of .obj or .ply files, one a frame; .npy of (frames, vertices, 3) or (frames, 3 vertices); or
-            FLAME parameters: shape_pose_cam.hdf5, or .npy of (1, frames, 403)
-        audio: the video, or its sound
+        motion: folder of .obj or .ply files, one a frame; .npy of (frames, vertices, 3) or (frames, 3 vertices);
+            FLAME parameters: shape_pose_cam.hdf5, or .npy of (1, frames, 403); or a video, which is tracked as by
+            `facediff data track`
+        audio: the video, or its sound; not for a video
         name: the person's name: letters, digits, dashes
         corpus: corpus of other speakers with the same topology
         output: folder to make
-        frame_rate: frames a second of MOTION
+        frame_rate: frames a second of MOTION; not for a video
         corpus_frame_rate: frames a second of the corpus; needed if ROOT has no manifest.json that says it
         template: neutral face (.obj, .ply, .npy) in MOTION's unit (default: the median of frames in which the person
             is silent and still)
@@ -318,7 +319,17 @@ def import_person(
     """
     from facediff.data.corpus import read_manifest
     from facediff.data.person import import_person as import_motion
+    from facediff.data.track.video import SUFFIXES
 
+    if motion.suffix.lower() in SUFFIXES:
+        from facediff.cli.track import import_video
+
+        tell(*import_video(motion, name, corpus, output, clip_seconds))
+        return
+    if audio is None or frame_rate is None:
+        raise FaceDiffError(
+            "--audio, --frame-rate: are needed for meshes, arrays and parameters; only a video has both"
+        )
     report = import_motion(
         motion,
         audio=audio,

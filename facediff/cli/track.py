@@ -16,6 +16,7 @@ from facediff.utils import SAMPLE_RATE, ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
+    from facediff.animation import Animation
     from facediff.data.track.corpus import TrackingReport
     from facediff.data.track.recording import Recording
     from facediff.data.track.video import Picture
@@ -136,6 +137,85 @@ def person(
         f"Next: facediff animate speech.wav {words} -o speech.mp4",
         f"      facediff animate speech.wav {words} --target-mesh avatar.glb -o speech.glb",
     )
+
+
+def import_video(video: Path, name: str, corpus: Path, output: Path, clip_seconds: float) -> Iterator[str]:
+    """Track a person's video as an entry of a corpus of people; the report, line by line."""
+    from facediff.data.corpus import read_manifest
+    from facediff.data.prepare.runner import MANIFEST
+    from facediff.data.track.corpus import CORPUS, find_videos, track_people
+    from facediff.utils.plain_files import write_json
+
+    facts = read_manifest(corpus)
+    if facts.get("corpus") != CORPUS:
+        raise FaceDiffError(
+            f"{corpus}: is no corpus of `facediff data track`, so that videos do not fit it; give meshes"
+        )
+    settings = {
+        key.removeprefix("--").replace("-", "_"): value for key, value in facts["options"].items() if "--" in key
+    }
+    options = TrackingOptions(**{**settings, "clip_seconds": clip_seconds})
+    report = track_people(find_videos(video, name), output, options)
+    # As an entry the folder belongs to one person, whom any data module takes next to its own.
+    write_json(output / MANIFEST, {**read_manifest(output), "corpus": "person", "person": name})
+    yield from lines_of(report)
+
+
+def with_tracked_styles(words: str, checkpoint: Path | str, identity: str | None) -> str:
+    """The words of ``--style`` with a motion, on the model's face, in place of each video of a person."""
+    from facediff.animation.style_files import split_styles
+    from facediff.data.track.video import SUFFIXES
+
+    if not words.lower().endswith(SUFFIXES) and not any(f"{suffix}:" in words.lower() for suffix in SUFFIXES):
+        return words
+    names = []
+    for part in split_styles(words):
+        is_video = Path(part.name).suffix.lower() in SUFFIXES
+        name = tracked_style(Path(part.name), checkpoint, identity) if is_video else part.name
+        names.append(str(name) if part.weight is None else f"{name}:{part.weight!r}")
+    return ",".join(names)
+
+
+def tracked_style(video: Path, checkpoint: Path | str, identity: str | None) -> Path:
+    """A file with the motion of a video's first clip on the face of a model; it is kept for the next time."""
+    import numpy as np
+
+    import facediff
+    from facediff.data.prepare.runner import write_mesh
+    from facediff.data.track.corpus import track_people
+    from facediff.utils.arrays import ArrayStore
+    from facediff.utils.checksums import sha256
+    from facediff.utils.files import cache_dir, scratch_folder
+
+    model = facediff.load(checkpoint)
+    who = identity or model.identities[0]
+    key = ArrayStore.key(sha256(video), model.corpus, model.n_vertices, who)
+    target = cache_dir() / "styles" / key / f"{video.stem}.npz"
+    if target.is_file():
+        return target
+    with scratch_folder(target) as scratch:
+        track_people({"style": [video]}, scratch / "people", TrackingOptions(face="largest"), workers=1)
+        motion = first_clip(scratch / "people")
+        if model.n_vertices != len(motion.template):
+            still = model.animate(np.zeros(SAMPLE_RATE, np.float32), SAMPLE_RATE, identity=who, seed=0)
+            write_mesh(scratch / "face.ply", still.template, still.triangles)
+            motion = motion.retarget(scratch / "face.ply")
+        motion.save(target)
+    return target
+
+
+def first_clip(root: Path) -> Animation:
+    """The first clip of a corpus of people as an animation."""
+    from facediff.animation import Animation
+    from facediff.data import People
+    from facediff.pipelines.trained import facts_of
+
+    corpus = (data := People(root=str(root))).corpus
+    clip = next(iter(corpus.clips.values()))
+    template = corpus.template(clip)
+    speech = corpus.read_audio(clip, 0, corpus.frames(clip)).numpy()
+    facts = facts_of(data.assets(), clip.identity)
+    return Animation(name=clip.name, vertices=(corpus.read_motion(clip) + template).numpy(), speech=speech, **facts)
 
 
 def write_preview(recording: Recording, path: Path) -> None:

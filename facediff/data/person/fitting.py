@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.corpus import MOTION_FOLDERS, find_region, read_manifest, read_templates
+from facediff.data.corpus import LIP_PAIRS, MOTION_FOLDERS, find_region, read_manifest, read_templates
 from facediff.data.person.motion import MESHES, Array, Faces, FaceSequence, differing_faces, scratch_array, spans
+from facediff.data.track.face import pair_distances
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
 from facediff.mesh.alignment import Indices, chunks
+from facediff.metrics import LipPairs
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.utils.arrays import open_array
 
@@ -31,6 +33,7 @@ STILL = 1e-6  # of the face's size: slower motion counts as none
 SAME_SIZE = 1.1  # template and motion must agree in size to this factor
 SMOOTHING = 0.2  # seconds over which loudness is averaged
 NEUTRAL_SHARE = 0.05  # share of the frames that the neutral face is the median of
+CLOSED = 0.012  # gap of closed lips as a share of the face's size, about 1 mm
 CLOSED_SHARE = 1 / 3  # of the frames with closed lips
 NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
 
@@ -47,6 +50,7 @@ class TargetCorpus:
     faces: Faces | None
     frame_rate: float
     unit: str | None
+    lip_pairs: Indices | None = None  # (P, 2) upper and lower vertices of the inner lips
 
     @property
     def n_vertices(self) -> int:
@@ -70,6 +74,7 @@ def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> Ta
         _corpus_faces(root, len(mean)),
         _frame_rate(root, manifest.get("frame_rate"), frame_rate),
         unit if isinstance(unit, str) else None,
+        np.array(LipPairs.from_file(root / LIP_PAIRS).pairs) if (root / LIP_PAIRS).is_file() else None,
     )
 
 
@@ -252,6 +257,7 @@ def choose_neutral(
     template: TemplateFile | None,
     speech: npt.NDArray[np.float32],
     frame_rate: float,
+    lip_pairs: Indices | None = None,
 ) -> NeutralFace:
     """The neutral face that was given, else the source's own, else one found in the frames without head motion."""
     if template is not None:
@@ -260,9 +266,13 @@ def choose_neutral(
     if motion.template is not None:
         return NeutralFace(motion.template, unmoved, "the model's shape without expression")
     covered = max(1, min(len(stabilised.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
-    chosen = neutral_frames(loudness(speech, covered, frame_rate), stabilised.speed[:covered]).tolist()
+    gaps = None if lip_pairs is None else pair_distances(stabilised.frames[:covered], lip_pairs)
+    closed = CLOSED * face_size(stabilised.face)
+    loud, speed = loudness(speech, covered, frame_rate), stabilised.speed[:covered]
+    chosen = neutral_frames(loud, speed, gaps, closed).tolist()
     face = np.median(stabilised.frames[chosen], axis=0).astype(np.float64)
-    source = f"median of {len(chosen)} silent and still frames (counted from 0): {spans(chosen)}"
+    mouth = "" if gaps is None else ", with the mouth closed,"
+    source = f"median of {len(chosen)} silent and still frames{mouth} (counted from 0): {spans(chosen)}"
     return NeutralFace(face, unmoved, source, chosen)
 
 

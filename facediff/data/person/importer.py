@@ -157,7 +157,7 @@ def _fit(
         stabilised = stabilise(read, face, still, scratch / "stable.npy")
     source = template or motion
     with _naming(source):
-        neutral = choose_neutral(read, stabilised, own_template, speech, frame_rate)
+        neutral = choose_neutral(read, stabilised, own_template, speech, frame_rate, target.lip_pairs)
         best, residual = lay_onto_corpus(source, neutral.face, target)
     place = into_coordinates(neutral.face, best, scale)
     return FittedSpeaker(stabilised, neutral, place, best.scale, residual, compared)

@@ -6,7 +6,6 @@ viewer, and as large as the canonical face of the model; the head's size in the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -163,7 +162,7 @@ def iris_width(faces: Array) -> float:
     return float(np.median([np.linalg.norm(rim[:, 0] - rim[:, 1], axis=1) for rim in rims]))
 
 
-def pair_distances(faces: npt.NDArray[np.floating], pairs: Sequence[tuple[int, int]] = LIP_PAIRS) -> Array:
+def pair_distances(faces: npt.NDArray[np.floating], pairs: npt.ArrayLike = LIP_PAIRS) -> Array:
     """Mean distance of pairs of vertices (T,), of the inner lips if no others are given, of faces (T, V, 3)."""
     upper, lower = np.asarray(pairs).T
     return np.asarray(np.linalg.norm(faces[:, upper] - faces[:, lower], axis=-1).mean(axis=-1))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import facediff
 from facediff.cli.app import main
+from facediff.cli.track import with_tracked_styles
 from facediff.data import People
 from facediff.data.corpus import read_clip_table, read_templates
 from facediff.data.track.topology import LIP_PAIRS
@@ -183,3 +186,31 @@ def test_splits_of_one_person_and_of_many(tmp_path: Path) -> None:
     assert by_split["test_b"] == {*unseen} - {"fay"}
     assert all(data.find_split(clip) is None for clip in data.corpus.clips.values() if clip.identity == "fay")
     assert People(root=str(out), extra_identities=["ada"]).identities == ["ada"]
+
+
+def test_a_video_joins_a_corpus_of_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    videos = write_people(tmp_path / "videos", {"ada": [talking(3), talking(3, seed=1)], "ben": [talking(3)]})
+    people, entry = tmp_path / "people", tmp_path / "ben"
+    assert track(videos / "ada", people) == 0
+    words = ["data", "import-person", str(videos / "ben" / "film0.mp4"), "--name", "ben", "--corpus", str(people)]
+    assert main([*words, "-o", str(entry)]) == 0
+    data = People(root=str(people), people=[str(entry)])
+    assert data.identities == ["ben", "ada"]
+    assert {clip.identity for clip in data.clips("train")} == {"ada", "ben"}
+    assert main(["data", "check", str(entry), "--quick", "--quiet"]) == 0
+    capsys.readouterr()
+    assert main(["data", "import-person", str(tmp_path / "m.npy"), "--name", "e", "--corpus", "x", "-o", "y"]) == 2
+
+
+def test_a_video_gives_a_style_on_the_models_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(3)))
+    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+    model = SimpleNamespace(identities=["ada"], corpus="people", n_vertices=468)
+    monkeypatch.setattr("facediff.load", lambda checkpoint: model)
+    words = with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt", None)
+    file, weight = words.split(",")[0].rsplit(":", 1)
+    motion = facediff.read(file)
+    assert (motion.vertices.shape[1:], motion.name, weight) == ((468, 3), "style_s001", "0.5")
+    assert with_tracked_styles("F1_e05", "model.ckpt", None) == "F1_e05"
+    monkeypatch.setattr("facediff.data.track.corpus.track_people", None)  # the second time nothing is tracked
+    assert with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt", None) == words
