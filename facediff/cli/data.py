@@ -322,9 +322,9 @@ def import_person(
     from facediff.data.track.video import SUFFIXES
 
     if motion.suffix.lower() in SUFFIXES:
-        from facediff.cli.track import import_video
+        from facediff.data.track.corpus import import_video
 
-        tell(*import_video(motion, name, corpus, output, clip_seconds))
+        tell(*import_video(motion, name, corpus, output, clip_seconds).lines())
         return
     if audio is None or frame_rate is None:
         raise FaceDiffError(

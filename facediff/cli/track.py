@@ -17,7 +17,6 @@ from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.data.track.corpus import TrackingReport
     from facediff.data.track.recording import Recording
     from facediff.data.track.video import Picture
 
@@ -68,20 +67,12 @@ def track(
             scheduler=work.scheduler,
             progress=not work.quiet,
         )
-    tell(*lines_of(report))
+    tell(*report.lines())
     if preview is not None:
         write_preview(report.first, preview)
         tell(f"{preview}: look whether the points follow lips and lids")
     tell(f"Next: facediff data check {output}")
     return 1 if report.failed else 0
-
-
-def lines_of(report: TrackingReport) -> Iterator[str]:
-    """The report, line by line."""
-    for person in report.people:
-        yield from person.lines()
-    for problem in report.failed.values():
-        yield f"not used: {problem}"
 
 
 def person(
@@ -120,7 +111,7 @@ def person(
         raise FaceDiffError(f"{video}: holds several people's videos; expected one's, or use `facediff data track`")
     with resumable(output):
         tracked = track_people(videos, root, tracking, workers=None, progress=not quiet)
-        tell(*lines_of(tracked))
+        tell(*tracked.lines())
         if not check(root, None, progress=not quiet).sound:
             raise FaceDiffError(f"{root}: is not sound; `facediff data check {root}` says why")
         data = People(root=str(root))
@@ -137,28 +128,6 @@ def person(
         f"Next: facediff animate speech.wav {words} -o speech.mp4",
         f"      facediff animate speech.wav {words} --target-mesh avatar.glb -o speech.glb",
     )
-
-
-def import_video(video: Path, name: str, corpus: Path, output: Path, clip_seconds: float) -> Iterator[str]:
-    """Track a person's video as an entry of a corpus of people; the report, line by line."""
-    from facediff.data.corpus import read_manifest
-    from facediff.data.prepare.runner import MANIFEST
-    from facediff.data.track.corpus import CORPUS, find_videos, track_people
-    from facediff.utils.plain_files import write_json
-
-    facts = read_manifest(corpus)
-    if facts.get("corpus") != CORPUS:
-        raise FaceDiffError(
-            f"{corpus}: is no corpus of `facediff data track`, so that videos do not fit it; give meshes"
-        )
-    settings = {
-        key.removeprefix("--").replace("-", "_"): value for key, value in facts["options"].items() if "--" in key
-    }
-    options = TrackingOptions(**{**settings, "clip_seconds": clip_seconds})
-    report = track_people(find_videos(video, name), output, options)
-    # As an entry the folder belongs to one person, whom any data module takes next to its own.
-    write_json(output / MANIFEST, {**read_manifest(output), "corpus": "person", "person": name})
-    yield from lines_of(report)
 
 
 def with_tracked_styles(words: str, checkpoint: Path | str, identity: str | None) -> str:

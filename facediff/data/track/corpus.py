@@ -92,6 +92,11 @@ class TrackingReport:
     failed: dict[str, str]
     first: Recording  # the first video that was used
 
+    def lines(self) -> list[str]:
+        """The report, a line each."""
+        problems = [f"not used: {problem}" for problem in self.failed.values()]
+        return [*(line for person in self.people for line in person.lines()), *problems]
+
 
 def find_videos(source: Path, name: str | None) -> dict[str, list[Path]]:
     """Videos by person: of a file or a folder of one person, or of a folder with a folder for each."""
@@ -166,6 +171,28 @@ def track_people(
         writer.finish({**manifest.get("people", {}), **{report.name: asdict(report) for report in reports}}, recipe)
         (out / STATE).unlink()
     return TrackingReport(out, tuple(reports), failed, writer.recordings[0])
+
+
+def import_video(video: Path, name: str, corpus: Path, out: Path, clip_seconds: float) -> TrackingReport:
+    """Track a person's video as an entry that any data module takes next to the people of a corpus.
+
+    Args:
+        video: the video.
+        name: the person's name.
+        corpus: corpus of people, whose settings are used.
+        out: folder to make.
+        clip_seconds: approximate length of a clip.
+    """
+    facts = read_manifest(corpus)
+    if facts.get("corpus") != CORPUS:
+        raise FaceDiffError(f"{corpus}: is no corpus of `facediff data track`, which videos need; give meshes")
+    settings = {
+        key.removeprefix("--").replace("-", "_"): value for key, value in facts["options"].items() if "--" in key
+    }
+    options = TrackingOptions(**{**settings, "clip_seconds": clip_seconds})
+    report = track_people(find_videos(video, name), out, options)
+    write_json(out / MANIFEST, {**read_manifest(out), "corpus": "person", "person": name})
+    return report
 
 
 def tracking_tasks(
