@@ -1,7 +1,7 @@
-"""Constructor arguments as plain data and back, so that checkpoints load with ``weights_only=True`` whoever made them.
+"""Constructor arguments as plain data and back, so that every checkpoint loads with ``weights_only=True``.
 
-:func:`describe` and :func:`plain` write what a model, a component or a data module was made with; :func:`read_options`
-reads what a file states, and lets nothing through but the plain values that the constructor's signature asks for.
+:func:`describe` and :func:`plain` write the arguments of a model, a component or a data module; :func:`read_options`
+reads the options in a file, and lets nothing through but the plain values that the constructor's signature asks for.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Components = Mapping[str, Callable[[str], type | None]]
 def plain(value: Any) -> Any:  # noqa: ANN401
     """Describe a constructor argument by numbers, strings, lists and dicts.
 
-    A component class, or a ``functools.partial`` of one (which is also what the command line hands over), becomes
+    A component class, or a ``functools.partial`` of one (the command line hands over such a partial too), becomes
     Lightning's form ``{"class_path": …, "init_args": {…}}``.
 
     Raises:
@@ -79,7 +79,7 @@ def component_class(factory: Any) -> type:  # noqa: ANN401
 def keeps_arguments(init: Callable[..., None]) -> Callable[..., None]:
     """Let a constructor pass its arguments to the object's ``keep_hyperparameters`` once it has run.
 
-    Of the constructors that run on the way, only that of the object's own class does so: a base class's constructor
+    Of the constructors that run on the way, only the one of the object's own class does so: a base class's constructor
     sees only some of the arguments. Each of them checks those that it names.
     """
     checked = checks_arguments(init)
@@ -98,12 +98,12 @@ def keeps_arguments(init: Callable[..., None]) -> Callable[..., None]:
 def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
     """A component's plain description for the checkpoint, with every option that it was made with.
 
-    Options left at their defaults are included: whoever rebuilds the component may fill what is missing from the
+    Options left at their defaults are included: code that rebuilds the component may fill missing options from the
     component that usually stands in its place.
 
     Args:
         factory: the component's class, or a ``functools.partial`` of it.
-        component: what the factory made. It may have a method ``checkpoint_init_args`` that returns constructor
+        component: made by the factory. It may have a method ``checkpoint_init_args`` that returns constructor
             arguments with which it can be built without the files that it was first built from (a pretrained network).
     """
     description: dict[str, Any] = plain(factory)
@@ -113,7 +113,7 @@ def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
 
 
 def read_options(source: str, owner: type, options: Mapping[str, Any], components: Components) -> dict[str, Any]:
-    """The arguments of a constructor from what a file states, or an error where they are anything but plain values.
+    """The arguments of a constructor from the options in a file, or an error where they are anything but plain values.
 
     Args:
         source: the file, for messages.
@@ -171,13 +171,13 @@ def read_component(source: str, name: str, value: object, components: Components
     return partial(component, **read_options(source, component, options, components))
 
 
-def unknown_class(source: object, role: str, named: object) -> FaceDiffError:
+def unknown_class(source: object, role: str, path: object) -> FaceDiffError:
     """The error for a class that is neither registered nor imported."""
-    shown = quoted(named).strip("'\"")
-    own = f", or add --model={shown} to `facediff test`, `validate` or `predict`" if role == "model" else ""
+    text = quoted(path).strip("'\"")
+    advice = f", or add --model={text} to `facediff test`, `validate` or `predict`" if role == "model" else ""
     return FaceDiffError(
-        f'{source}: its {role} is "{shown}", which is not known; it was not loaded. If you trust the file, install or '
-        f"import the package that the {role} comes from{own}"
+        f'{source}: its {role} is "{text}", which is not known; it was not loaded. If you trust the file, install or '
+        f"import the package that the {role} comes from{advice}"
     )
 
 
@@ -185,7 +185,7 @@ def takes_options(group: type) -> Callable[[Callable[..., None]], Callable[..., 
     """Let a constructor take the fields of a dataclass as keyword arguments of its own.
 
     The constructor itself receives them as an instance of the dataclass, in front of its other options. Its signature
-    and its docstring are those of the fields, so that the command line, checkpoints and documentation show each option.
+    and its docstring come from the fields, so that the command line, checkpoints and documentation show each option.
 
     Args:
         group: a dataclass with a default for every field.
@@ -227,9 +227,9 @@ def takes_options(group: type) -> Callable[[Callable[..., None]], Callable[..., 
 
 
 def with_classes(options: Options) -> Options:
-    """A model's options with each component's class in place of what makes the component, for a model to keep.
+    """A model's options with each component's class in place of its factory, for a model to keep.
 
-    What the command line makes components with holds the parser, and with it the trainer and its processes, which
+    Factories of the command line hold the parser, and with it the trainer and its processes, which
     weight averaging would copy together with the model.
 
     Args:

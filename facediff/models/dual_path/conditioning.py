@@ -41,17 +41,17 @@ class Hidden(NamedTuple):
 
 @dataclass(frozen=True)
 class Conditions:
-    """What does not change over the denoising steps of a clip.
+    """Everything that stays constant over the denoising steps of a clip.
 
     Attributes:
         audio: speech features F_a.
         style: style tokens, the condition F_s.
         mask: True on valid frames.
-        fusion: what the fusion prepared for inference.
-        decoder: what the decoder prepared for inference.
+        fusion: prepared by the fusion for inference.
+        decoder: prepared by the decoder for inference.
         step_table: the embedding of each step; None if steps are embedded as they come.
         shares: under guidance the rows are all clips, then all clips with some conditions hidden, and so on; this is
-            what the prediction of each of these parts contributes.
+            the contribution of each part's prediction.
         dynamic: F_dyn of the clips, as it was encoded; None where conditions were changed.
     """
 
@@ -68,8 +68,8 @@ class Conditions:
         """The conditions of some of the frames, with nothing prepared."""
         return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end], shares=self.shares)
 
-    def drawn(self, times: int) -> Conditions:
-        """The conditions of several noisy versions of every clip, those of a clip one after the other."""
+    def masks(self, times: int) -> Conditions:
+        """The conditions of several noisy versions of every clip, clip by clip."""
         audio, style, mask = (value.repeat_interleave(times, 0) for value in (self.audio, self.style, self.mask))
         return Conditions(audio, style, mask, shares=self.shares)
 
@@ -97,7 +97,7 @@ class StyleTokens(nn.Module):
 
     def __init__(self, token_dims: tuple[int, ...], dim: int, form: TokenForm) -> None:
         super().__init__()
-        # The paper's form, whose attention has nothing to choose between; kept for comparison.
+        # The paper's form, for comparison; its attention has nothing to choose between.
         if form == "single" and token_dims:
             token_dims = (sum(token_dims),)
         self.token_dims = token_dims
@@ -115,7 +115,7 @@ class StyleTokens(nn.Module):
 
 
 class TemplateToken(nn.Module):
-    """The neutral face f as a token beside those of the style, for how a face moves follows from its shape too.
+    """The neutral face f as a token beside the style tokens, since the way a face moves follows from its shape too.
 
     Args:
         points: vertices.
@@ -133,7 +133,7 @@ class TemplateToken(nn.Module):
         self.project = nn.Linear(points * dims, dim)
 
     def measure(self, templates: Float[Tensor, "identities points dims"]) -> None:
-        """Take the mean and the size of faces from those of the training; a single face counts as it is."""
+        """Measure mean and size on the faces of the training; a single face counts as it is."""
         self.mean.copy_(templates.mean(0))
         deviation = (templates - self.mean).square().mean().sqrt()
         self.deviation.copy_(deviation if deviation > 0 else torch.ones(()))
@@ -172,7 +172,7 @@ class ConditionEncoding(nn.Module):
 
     @property
     def style_dim(self) -> int:
-        """Numbers of a style vector: F_dyn, and with :class:`SpeechStyle` how much of what the speech asks is added."""
+        """Numbers of a style vector: F_dyn, and with :class:`SpeechStyle` the share of its change."""
         return sum(self.style_encoder.token_dims) + (self.speech_style is not None)
 
     def style_from_speech(
@@ -251,7 +251,7 @@ class ConditionEncoding(nn.Module):
 
 
 def check_shape(part: nn.Module, result: Tensor, *expected: int) -> None:
-    """Name a component, perhaps of a user's own, whose result would end in an error elsewhere."""
+    """Name a component, perhaps a user's own, with a result of the wrong shape, before it fails elsewhere."""
     if not exporting() and result.shape != expected:
         raise FaceDiffError(f"{type(part).__name__}: gives the shape {tuple(result.shape)}; expected {expected}")
 
@@ -265,7 +265,7 @@ class HidingOptions(Protocol):
 
 
 class ConditionedModel(AnimationModel):
-    """A model whose conditions are hidden now and then in training, so that sampling can be guided by them."""
+    """A model whose conditions are sometimes hidden in training, so that sampling can be guided by them."""
 
     network: ConditionEncoding
     options: HidingOptions
@@ -283,7 +283,7 @@ class ConditionedModel(AnimationModel):
         return [name for name in CONDITIONS if shares[name] > 0]
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
-        """Follow conditions more (above 1) or less from now on; checkpoints keep what the model was made with."""
+        """Follow conditions more (above 1) or less from now on; checkpoints keep the original scales."""
         for name, scale in scales.items():
             if name not in CONDITIONS:
                 raise FaceDiffError(f'guidance: there is no condition "{name}": {choices(name, CONDITIONS)}')
@@ -301,11 +301,11 @@ class ConditionedModel(AnimationModel):
 
         With the conditions c₁ … c_K that can be hidden and their scales w₁ … w_K, the prediction is
         G(∅) + Σ_k w_k [G(c₁ … c_k) − G(c₁ … c_{k−1})] (incremental guidance; Sun et al. 2024, DiffPoseTalk, after Ho
-        and Salimans 2022). Predictions whose share is zero are not computed: with all scales 1 there is one.
+        and Salimans 2022). Predictions with a share of zero are not computed: with all scales 1 there is one.
         """
         names = self.guidable
         scales = [1.0, *(self.guidance[name] for name in names), 0.0]
-        shares = {tuple(names[shown:]): scales[shown] - scales[shown + 1] for shown in range(len(names) + 1)}
+        shares = {tuple(names[k:]): scales[k] - scales[k + 1] for k in range(len(names) + 1)}
         return {hidden: share for hidden, share in shares.items() if share}
 
     def conditions(self, batch: Batch, *, guided: bool = False, animated: slice = slice(None)) -> Conditions:
@@ -340,14 +340,14 @@ class ConditionedModel(AnimationModel):
             "style": self.options.style_dropout,
             "speech": self.options.speech_dropout,
         }
-        drawn = {
+        masks = {
             name: torch.rand(clips, device=self.device) < share if share else None for name, share in shares.items()
         }
         # Guidance starts from the motion without any of the conditions that can be hidden, which would hardly ever be
         # seen if each were drawn by itself.
-        if (silent := drawn["speech"]) is not None:
-            drawn = {name: None if mask is None else mask | silent for name, mask in drawn.items()}
-        return Hidden(**drawn)
+        if (silent := masks["speech"]) is not None:
+            masks = {name: None if mask is None else mask | silent for name, mask in masks.items()}
+        return Hidden(**masks)
 
     def _in_views(self, name: str, views: Mapping[tuple[str, ...], float], clips: int) -> Tensor:
         return torch.tensor([name in hidden for hidden in views], device=self.device).repeat_interleave(clips)

@@ -108,7 +108,7 @@ class Generation(Recipe):
         # At the last step nothing of the motion is left in the noise, so the prediction that errs least is the mean of
         # all motions that the conditions allow. A network lets some of the noise through all the same, nearly linearly:
         # between noise and its negative that cancels (2 evaluations leave 1/20 of the variance of one). The noise is
-        # the mean's own, so that a clip has one mean whatever the seed.
+        # the mean's own, so that a clip has one mean for all seeds.
         noise = denoiser.noise(unit(self.empty_state(denoiser)))
         last = self.process.steps - 1
         first, second = (self.decode(denoiser, denoiser.denoise(start, last), frames) for start in (noise, -noise))

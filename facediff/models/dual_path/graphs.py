@@ -32,7 +32,7 @@ from facediff.registry import name_of
 
 
 class DualPathModel(GraphedModel, Protocol):
-    """What the graphs need of a dual-path model."""
+    """A dual-path model as its graphs see it."""
 
     network: DualPathNetwork
     motion_space: MotionSpace
@@ -74,7 +74,7 @@ class StepGraph(ModelPart[DualPathModel]):
         before: Float[Tensor, "batch frames kept"],
         share: Float[Tensor, "batch frames"],
     ) -> tuple[Tensor, Tensor]:
-        """The prediction, and what the next window of long speech takes as ``before``.
+        """The prediction, and the features that the next window of long speech takes as ``before``.
 
         Args:
             features: of the speech.
@@ -83,21 +83,21 @@ class StepGraph(ModelPart[DualPathModel]):
             style: style vectors.
             state: the noisy motion.
             step: counted from 0.
-            before: what the window before kept, in the frames that this one shares with it.
+            before: features of the window before, in the frames that this one shares with it.
             share: of this window in each frame, 1 where nothing is shared.
         """
-        network, kept = self.model.network, list[Tensor]()
+        network, joined = self.model.network, list[Tensor]()
         dynamic = network.style_from_speech(style, features, mask)
         tokens = network.style_tokens(torch.cat([network.identity_encoder(identity), dynamic], dim=-1))
 
         # Two windows of long speech are joined within the denoising step, so that both go on from one motion. The graph
-        # hands out what it joined, since the next window's graph runs later and elsewhere.
-        def blend(now: Tensor) -> Tensor:
-            kept.append(torch.lerp(before, now, share[..., None]))
-            return kept[0]
+        # hands out the joined features, since the next window's graph runs later and elsewhere.
+        def blend(latest: Tensor) -> Tensor:
+            joined.append(torch.lerp(before, latest, share[..., None]))
+            return joined[0]
 
         denoiser = self.model.denoiser(Conditions(features, tokens, mask), blend)
-        return denoiser.denoise(state, step), kept[0]
+        return denoiser.denoise(state, step), joined[0]
 
 
 class SampleGraph(ModelPart[DualPathModel]):
@@ -130,9 +130,9 @@ def graphs_of(model: DualPathModel) -> Graphs:
     batch, frames, width = 2, 50, network.coordinates
     dim = network.embed.out_features
     state = dim if folded else width
-    kept = width if preconditioned else dim
+    handover = width if preconditioned else dim
     encoder = network.audio_encoder
-    speech = speech_graph(model, lambda heard, frames, _: encoder(heard.audio, heard.audio_lengths, frames))
+    speech = speech_graph(model, lambda batch, frames, _: encoder(batch.audio, batch.audio_lengths, frames))
     style = network.style_dim
     mask = torch.ones(batch, frames, dtype=torch.bool)
     step = Graph(
@@ -145,7 +145,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
             "style": torch.ones(batch, style),  # the last asks for what the speech says, so that its map is made
             "state": torch.zeros(batch, frames, state),
             "step": torch.zeros(batch, dtype=torch.long),
-            "before": torch.zeros(batch, frames, kept),
+            "before": torch.zeros(batch, frames, handover),
             "share": torch.ones(batch, frames),
         },
         {
@@ -163,7 +163,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
     last = Graph(
         "motion",
         SampleGraph(model, decoded),
-        {"sample": torch.zeros(batch, frames, kept if folded else state)},
+        {"sample": torch.zeros(batch, frames, handover if folded else state)},
         {"sample": FRAMES},
         ("offsets",),
     )
@@ -176,7 +176,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
         sampling=SamplingLoop(
             state=state,
             drawn=state,
-            kept=kept,
+            handover=handover,
             sampler=name_of(type(sampler)),
             steps=list(sampler.timesteps),
             table=update_table(sampler),

@@ -2,7 +2,7 @@
 
 The audio encoder, the style encoder, fusion and decoder work in the model's width and know nothing of a face. What does
 is a head: the motion space with its maps into that width and out of it, the mesh encoder, and the identities. Every
-face is therefore a :class:`DualPathDiffusion` whose trunk is that of the first one.
+face is therefore a :class:`DualPathDiffusion` with the trunk of the first one.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from facediff.registry import model
 class ManyFaces(DualPathDiffusion):
     """A dual-path model of several faces, each with a head of its own, trained together on a corpus for each.
 
-    It is the first face's model, whose corpus is the data module's own, and :attr:`further_faces` has those of
+    It is the first face's model, for the data module's own corpus, and :attr:`further_faces` has the models for
     ``data.further_corpora``. Once trained, each is animated, tested and exported like a model of its own, by its name
     after the checkpoint's: ``best.ckpt:mask``.
 
     Args:
         faces: sizes of the further faces by name, as :attr:`facediff.data.SpeechMotionDataModule.faces` has them; taken
             from the data module on the command line.
-        options: those of :class:`DualPathDiffusion`, for all faces.
+        options: of :class:`DualPathDiffusion`, for all faces.
 
     Attributes:
         further_faces: the models of all faces but the first.
@@ -65,7 +65,7 @@ class ManyFaces(DualPathDiffusion):
         return cast(Iterator[tuple[str, DualPathDiffusion]], iter(self.further_faces.items()))
 
     def own_modules(self) -> Iterator[nn.Module]:
-        """Those of the first face."""
+        """The modules of the first face."""
         return (module for part in self.children() if part is not self.further_faces for module in part.modules())
 
     def model_of(self, batch: Batch) -> DualPathDiffusion:
@@ -114,15 +114,15 @@ class ManyFaces(DualPathDiffusion):
         scores = []
         for name in sorted(self._validated):  # a rehearsal of two batches sees two faces at most
             scores.append(self.face(name).evaluation.scalars("val"))
-            own = {f"val/{name}/{key.removeprefix('val/')}": value for key, value in scores[-1].items() if name}
-            self.log_dict(own, sync_dist=True)
+            metrics = {f"val/{name}/{key.removeprefix('val/')}": value for key, value in scores[-1].items() if name}
+            self.log_dict(metrics, sync_dist=True)
         self._validated.clear()
         shared = [key for key in scores[0] if all(key in one for one in scores)] if scores else []
         means = {key: mean_over_faces([float(one[key]) for one in scores]) for key in shared}
         self.log_dict({**self.validation_terms(), **means}, prog_bar=False, sync_dist=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what the further faces' own models keep."""
+        """Add the content of the further faces' models."""
         super().on_save_checkpoint(checkpoint)
         faces: dict[str, dict[str, Any]] = {}
         for name, face in self.heads():

@@ -161,7 +161,7 @@ class DualPathDiffusion(Generation):
     vertex motion. Every part is chosen by name.
 
     Args:
-        options: those of :class:`DualPathOptions` as keyword arguments, and those of every model
+        options: of :class:`DualPathOptions` as keyword arguments, and of every model
             (:class:`facediff.models.AnimationModel`).
     """
 

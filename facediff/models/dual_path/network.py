@@ -115,10 +115,10 @@ class DualPathNetwork(ConditionEncoding):
         self.template_token = template_token
         self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
 
-    def share_trunk(self, other: DualPathNetwork) -> None:
-        """Replace the parts whose sizes no corpus decides by those of another network, which then learn from both."""
+    def share_trunk(self, source: DualPathNetwork) -> None:
+        """Take the parts of :data:`TRUNK` from another network; they then learn from both corpora."""
         for name in TRUNK:
-            setattr(self, name, getattr(other, name))
+            setattr(self, name, getattr(source, name))
 
     def trunk(self) -> list[nn.Parameter]:
         """The weights of :data:`TRUNK`."""
@@ -176,13 +176,13 @@ class DualPathNetwork(ConditionEncoding):
         blend: Blend = unchanged,
         preconditioning: Preconditioning | None = None,
     ) -> ConditionalDenoiser:
-        """Everything that is constant over the denoising steps of a clip or window, as what a sampler calls.
+        """The denoiser that a sampler calls, with everything constant over the denoising steps of a clip or window.
 
-        It holds for the weights and the precision in which it was made, so it is made again for every run; what follows
-        from the weights alone is kept until they change.
+        Valid for the current weights and precision only, so it is made again for every run; what follows from the
+        weights alone is cached until they change.
 
         Args:
-            conditions: as :meth:`conditions` gives them, or those of some frames.
+            conditions: as :meth:`conditions` gives them, or of some frames.
             steps: the process's steps N.
             folded: run in the width of the model where both ends are linear, else on the vertices.
             blend: changes the features that the network gives in every step.
@@ -205,11 +205,13 @@ class DualPathNetwork(ConditionEncoding):
         audio, style, mask = conditions.audio, conditions.style, conditions.mask
         # For a window of long speech these are made from its own frames, since positions count from the window's start.
         fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
-        ready = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
+        prepared = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
         if preconditioning is not None:
-            rows = mask if len(ready.shares) == 1 else mask.chunk(len(ready.shares))[0]  # guided views repeat the rows
-            return PreconditionedDenoiser(self, ready, preconditioning, rows, blend, ready.shares)
-        return ConditionalDenoiser(self, ready, product, blend, ready.shares)
+            rows = (
+                mask if len(prepared.shares) == 1 else mask.chunk(len(prepared.shares))[0]
+            )  # guided views repeat the rows
+            return PreconditionedDenoiser(self, prepared, preconditioning, rows, blend, prepared.shares)
+        return ConditionalDenoiser(self, prepared, product, blend, prepared.shares)
 
 
 class StepEmbedding(nn.Module):

@@ -96,7 +96,7 @@ class VertexObjective(Objective):
 
 @dataclass(kw_only=True)
 class ComponentObjective(Objective):
-    """Squared errors in a space of known variances, where the network predicts what the noisy motion leaves open.
+    """Squared errors in a space of known variances; the network predicts the part that the noisy motion leaves open.
 
     Attributes:
         preconditioning: the scales around the network.
@@ -126,7 +126,7 @@ def objective_of(model: Recipe, batch: Batch, step: Int[Tensor, " draws"], draws
     Args:
         model: trained by it.
         batch: clips with their true motion.
-        step: of every draw, those of a clip one after the other.
+        step: of every draw, clip by clip.
         draws: noisy versions of every clip.
     """
     space, motion, mask = model.motion_space, batch.motion, batch.mask

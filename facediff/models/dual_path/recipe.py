@@ -1,7 +1,7 @@
 """The training and sampling recipe around the paper's method: every rule here is ours, with the figures in the manual.
 
-Where the training steps lie (:func:`log_snr_weights`), how loud the noise is (:func:`noise_scale_for`), what a small
-number of sampling steps changes (:func:`last_noise_for`, :func:`spread_for`), and which style an identity has without a
+Where the training steps lie (:func:`log_snr_weights`), how loud the noise is (:func:`noise_scale_for`), how a small
+number of sampling steps ends (:func:`last_noise_for`, :func:`spread_for`), and which style an identity has without a
 reference. docs/generation.md shows what each is worth; docs/method.md lists the options.
 """
 
@@ -46,7 +46,7 @@ def log_snr_weights(process: NoiseProcess, hidden: Float[Tensor, " steps"]) -> F
     a two-hundredth of the motion open to where it leaves 70 %; the others are uniform over all steps.
 
     Args:
-        process: whose steps are drawn.
+        process: the noise process.
         hidden: the share of the motion that noise leaves open in each step, rising.
     """
     signal = process.signal.cpu().double()
@@ -91,16 +91,16 @@ def noise_scale_for(
 
 
 MANY_STEPS = 10
-"""So many steps go to the last noise, whatever number a model is used to: the rule below is of sweeps up to it."""
+"""So many steps go to the last noise in every model: the rules below are from sweeps up to it."""
 
 
 def last_noise_for(first_noise: float, last_noise: float, share: float) -> float:
     """The noise at which a path of fewer steps ends best.
 
-    What a step at little noise adds are details of a sample, and only where the steps before it have got near: two
-    steps, one at full noise and one at the last noise of ten, give the mean motion with what the noise leaks into it.
+    A step at little noise adds details of a sample, and only where the steps before it have got near: two
+    steps, one at full noise and one at the last noise of ten, give the mean motion with a leak of noise.
     The path in ln SNR is shortened by the square root of the share of steps, near the best ends of sweeps with two to
-    five steps, around which scores are flat; docs/generation.md has what it gives.
+    five steps, around which scores are flat; docs/generation.md has figures.
 
     Args:
         first_noise: from which steps are spread evenly in ln SNR.
@@ -118,9 +118,9 @@ def last_noise_for(first_noise: float, last_noise: float, share: float) -> float
 def spread_for(first_noise: float, last_noise: float, share: float) -> float:
     """The :attr:`Sampler.spread` that lets few steps vary as much as the usual number.
 
-    A path that ends at more noise shows less of what the conditions leave open: by 1 + 8 (noise − usual noise) / first
-    noise, within 8 % of a sweep with two to eight steps of the bundled model (docs/generation.md). The factor is the
-    root of it, since it counts twice.
+    A path that ends at more noise shows less of the variance that the conditions leave open: by 1 + 8 (noise − usual
+    noise) / first noise, within 8 % of a sweep with two to eight steps of the bundled model (docs/generation.md). The
+    factor is the root of it, since it counts twice.
 
     Args:
         first_noise: from which steps are spread evenly in ln SNR.
@@ -146,7 +146,7 @@ class RecipeOptions(HidingOptions, Protocol):
 
 
 class Recipe(ConditionedModel):
-    """What a dual-path model measures before its training, and what may be chosen for its sampling."""
+    """A dual-path model's measurements before its training, and the settings of its sampling."""
 
     low_latency_steps = LOW_LATENCY_STEPS
     network: DualPathNetwork
@@ -166,7 +166,7 @@ class Recipe(ConditionedModel):
             return None
         if weights is None or not self.training:
             weights = log_snr_weights(self.process, scales.hidden().cpu()).to(self.device)
-            # Not from validation: weight averages are swapped in there, whose tables may not be known yet.
+            # Not from validation: weight averages are swapped in there, with tables that may not be known yet.
             self._step_weights = weights if self.training else None
         return weights
 
@@ -186,7 +186,7 @@ class Recipe(ConditionedModel):
             variances = shapes[:PRINCIPAL].square().sum(1)
             noised = space.noised_variances(variances)
             if covariance is not None and isinstance(space, ComponentMotion):
-                # What a frame hides is less when its neighbours tell it.
+                # Neighbouring frames reveal part of a noisy frame.
                 noised, variances = space.modes(covariance)
             self.rescale_noise(noise_scale_for(noised, variances))
         space.fit(self.process.signal, covariance)
@@ -195,17 +195,17 @@ class Recipe(ConditionedModel):
             token.measure(torch.stack([faces[identity] for identity in self.identities if identity in faces]))
         return shapes
 
-    def scale_like(self, other: Recipe, data: SpeechMotionDataModule) -> None:
+    def scale_like(self, reference_model: Recipe, data: SpeechMotionDataModule) -> None:
         """Give the largest movement the size that it has in another face's model.
 
         Unit variance of a coordinate says little: 60 weights are smaller as a whole than the coordinates of 6 000
         vertices by a factor of 20, and the same noise would hide another share of them.
 
         Args:
-            other: a measured model.
+            reference_model: a measured model.
             data: this model's corpus, on which it has been measured too.
         """
-        space, reference = self.motion_space, other.motion_space
+        space, reference = self.motion_space, reference_model.motion_space
         scale = self.assets.motion_scale
         if scale is None or not isinstance(space, ComponentMotion) or not isinstance(reference, ComponentMotion):
             return
@@ -298,7 +298,7 @@ class Recipe(ConditionedModel):
         self.choose_sampler(steps=min(self.low_latency_steps, self.sampler.steps))
 
     def choose_expressivity(self, expressivity: Expressivity) -> None:
-        """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep what the model was made with."""
+        """Go from the mean prediction (0) to a sample (1) or beyond; checkpoints keep the original value."""
         # One number for each vertex lets the lips follow the mean while the brows are sampled.
         numbers = expressivity.flatten().tolist() if isinstance(expressivity, Tensor) else [expressivity]
         if isinstance(expressivity, Tensor) and expressivity.shape != (self.n_vertices,):
@@ -315,8 +315,8 @@ class Recipe(ConditionedModel):
         """The style predicted from the speech, by a model that was trained to.
 
         A stored reference would carry its mood into all speech. With ``style_from_speech``, the usual style of an
-        identity of the training, or else that of its reference, is changed as the speech asks; with ``style_dropout``
-        alone, the model knows the motion of an identity of the training without a reference.
+        identity of the training, or else the style of its reference, is changed as the speech asks; with
+        ``style_dropout`` alone, the model knows the motion of an identity of the training without a reference.
         """
         no_style, speech_style = self.network.no_style, self.network.speech_style
         if speech_style is not None and speech_style.ready and identity not in self.person_styles:

@@ -10,30 +10,30 @@ from facediff.models.folding import WeightCache
 from facediff.models.speaker_encoders import mean_and_deviation
 
 MEMORY = 0.999
-"""Share of what is known that stays after a training step: the last 8 000 clips of steps of eight count."""
+"""Share of the statistics that stays after a training step: the last 8 000 clips of steps of eight count."""
 RIDGE = 0.03
 """Penalty of the map, as a share of the statistics' variance."""
 USUAL = 3.0
-"""Standard deviations up to which a statistic counts; rooms and voices that nobody trained with lie beyond."""
+"""Standard deviations up to which a statistic counts; rooms and voices outside the training data lie beyond."""
 REACH = 2.0
-"""Longest change of the style, in root mean squares of what the training speech asks for."""
+"""Longest change of the style, in root mean squares of the changes that the training speech asks for."""
 
 
 class SpeechStyle(nn.Module):
     """The change of an identity's usual style that its speech asks for: a linear map, fitted beside the training.
 
-    Where nobody names a style, a model has the identity and the speech alone. Its learnt stand-in for a hidden style
+    Without a reference, a model has the identity and the speech alone. Its learnt stand-in for a hidden style
     leaves the mood to the denoising network, which hardly takes it up in a short training; a regression on the style
     vectors themselves does (docs/generation.md has the figures).
 
     With the statistics x of a clip's speech features (mean and deviation of each channel) and the clip's style vector
     s, W minimises E‖s − s̄ − W x̂‖² + λ‖W‖², where s̄ is the mean style of the clip's identity and x̂ is x, standardised
-    over all speakers: a voice that was never heard has no mean of its own. The sums that this needs are updated in
+    over all speakers: an unseen voice has no mean of its own. The sums that this needs are updated in
     every training step, at no further pass of an encoder, and older steps fade from them as the encoders change. Where
     several processes train, the first one's clips count, which are drawn from all in every epoch.
 
-    Speech is heard as it is animated: in a stream, each window asks by its own speech, and of windows of a second the
-    answers vary by half as much as those of different clips.
+    Speech counts as it is animated: in a stream, each window asks by its own speech, and of windows of a second the
+    answers vary by half as much as between clips.
 
     Args:
         dim: channels of the speech features.
@@ -69,19 +69,19 @@ class SpeechStyle(nn.Module):
         identity: Int[Tensor, " batch"],
         memory: float = MEMORY,
     ) -> None:
-        """Take in the clips of a training step; those of hidden identities are left out.
+        """Take in the clips of a training step; clips of hidden identities are left out.
 
         Args:
             features: of their speech.
             mask: True on valid frames.
             style: their style vectors.
             identity: indices, −1 for hidden.
-            memory: share of what is known that stays.
+            memory: share of the statistics that stays.
         """
-        known = identity >= 0
-        style, identity = style.to(self.styles.dtype)[known], identity[known]
+        visible = identity >= 0
+        style, identity = style.to(self.styles.dtype)[visible], identity[visible]
         with torch.autocast(features.device.type, enabled=False):
-            numbers = self._numbers(features[known], mask[known]).to(style.dtype)
+            numbers = self._numbers(features[visible], mask[visible]).to(style.dtype)
             for vector, index in zip(style, identity.tolist(), strict=True):
                 self.counts[index] += 1
                 self.styles[index].lerp_(vector, max(1 / float(self.counts[index]), 1 - memory**8))

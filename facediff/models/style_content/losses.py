@@ -54,7 +54,7 @@ class MotionDistance:
 
         Args:
             motion: offsets from the template.
-            truth: what they should be.
+            truth: their target.
             mask: frames that count.
             vertices: vertices that count; all if None.
             rest: the templates in the motion's unit, for the gap.
@@ -90,27 +90,27 @@ def frame_mean(values: Float[Tensor, "batch frames"], mask: Mask) -> Float[Tenso
 
 
 def squared_distance(
-    values: Float[Tensor, "batch frames dim"], others: Float[Tensor, "batch frames dim"], mask: Mask
+    values: Float[Tensor, "batch frames dim"], target: Float[Tensor, "batch frames dim"], mask: Mask
 ) -> Float[Tensor, ""]:
     """Mean squared difference on valid frames, as it is; 0 if there is none."""
-    return frame_mean((values - others).square().mean(2), mask)
+    return frame_mean((values - target).square().mean(2), mask)
 
 
 def relative_distance(
-    values: Float[Tensor, "batch frames dim"], others: Float[Tensor, "batch frames dim"], mask: Mask
+    values: Float[Tensor, "batch frames dim"], target: Float[Tensor, "batch frames dim"], mask: Mask
 ) -> Float[Tensor, ""]:
     """Mean squared difference as a share of the variance of the values.
 
     A share, so that it is not made small by making all values small.
     """
-    kept, other = values[mask], others[mask]
+    first, second = values[mask], target[mask]
     # A single frame has no variance to be a share of.
-    if len(kept) < 2:
+    if len(first) < 2:
         return values.new_zeros(())
     # Two independent values of one distribution are twice its variance apart, hence the factor 2: unrelated contents
     # then have the distance 2, and equal ones 0.
-    spread = kept.var(0, correction=0).mean() + other.var(0, correction=0).mean()
-    return 2 * (kept - other).square().mean() / (spread + EPSILON)
+    spread = first.var(0, correction=0).mean() + second.var(0, correction=0).mean()
+    return 2 * (first - second).square().mean() / (spread + EPSILON)
 
 
 def style_distance(styles: Float[Tensor, "clips dim"], identities: Sequence[str]) -> Float[Tensor, ""]:
@@ -118,14 +118,14 @@ def style_distance(styles: Float[Tensor, "clips dim"], identities: Sequence[str]
 
     Args:
         styles: style vectors.
-        identities: whose they are.
+        identities: of the speakers.
     """
     count = len(identities)
     pairs = [(i, k) for i in range(count) for k in range(i + 1, count) if identities[i] == identities[k]]
     if not pairs:
         return styles.new_zeros(())
-    one, other = torch.tensor(pairs, device=styles.device).T
-    return (styles[one] - styles[other]).square().mean()
+    first, second = torch.tensor(pairs, device=styles.device).T
+    return (styles[first] - styles[second]).square().mean()
 
 
 def dynamics_distance(
@@ -133,7 +133,7 @@ def dynamics_distance(
     truths: Motion,
     mask: Mask,
     truth_mask: Mask,
-    chosen: Bool[Tensor, " batch"],
+    counted: Bool[Tensor, " batch"],
     vertices: Int[Tensor, " region"],
 ) -> Float[Tensor, ""]:
     """Mean over vertices of (σ − σ̂)² / σ̄², σ the spread over time of a vertex's squared displacement, as in FDD.
@@ -143,17 +143,17 @@ def dynamics_distance(
 
     Args:
         motion: (B, T, V, 3).
-        truths: (B, T, V, 3), whose spread the motions should have.
+        truths: (B, T, V, 3), with the spread that the motions should have.
         mask: valid frames of the motions.
         truth_mask: valid frames of the truths.
-        chosen: which clips count.
+        counted: True on the clips that count.
         vertices: vertices that count.
     """
-    if not chosen.any():
+    if not counted.any():
         return motion.new_zeros(())
     # FDD's own quantity is the spread of the squared displacement, so the loss compares the same one.
-    squared = [clips.index_select(2, vertices)[chosen].square().sum(-1) for clips in (motion, truths)]
-    spread, true_spread = masked_std(squared[0], mask[chosen]), masked_std(squared[1], truth_mask[chosen])
+    squared = [clips.index_select(2, vertices)[counted].square().sum(-1) for clips in (motion, truths)]
+    spread, true_spread = masked_std(squared[0], mask[counted]), masked_std(squared[1], truth_mask[counted])
     return (spread - true_spread).square().mean() / (true_spread.mean().square() + EPSILON)
 
 
@@ -164,7 +164,7 @@ class Pairing:
     Attributes:
         partner: index of the partner; a clip without one is its own.
         frames: for each frame the partner's frame of the same sound; 0 where the two are not aligned.
-        aligned: True on valid frames of clips whose partner says the same sentence.
+        aligned: True on valid frames of clips with a partner that says the same sentence.
     """
 
     partner: Int[Tensor, " batch"]
@@ -179,8 +179,8 @@ class Pairing:
     @property
     def unaligned(self) -> Bool[Tensor, " batch"]:
         """Clips with a partner who says something else."""
-        alone = self.partner == torch.arange(len(self.partner), device=self.partner.device)
-        return ~alone & ~self.aligned.any(1)
+        unpaired = self.partner == torch.arange(len(self.partner), device=self.partner.device)
+        return ~unpaired & ~self.aligned.any(1)
 
 
 def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
@@ -200,24 +200,24 @@ def pair_up(batch: Batch, alignments: Alignments | None) -> Pairing:
             or batch.sentences[clip] == batch.sentences[clip + 1]
         ):
             partner[clip], partner[clip + 1] = clip + 1, clip
-    places = torch.zeros(count, frames, dtype=torch.long)
+    partner_frames = torch.zeros(count, frames, dtype=torch.long)
     aligned = torch.zeros(count, frames, dtype=torch.bool)
     if alignments is not None and batch.partner_frames is not None:
         # Windows of clips, which the data set has aligned already, from the speech of the whole clips.
-        places = batch.partner_frames.cpu().clamp_min(0)
+        partner_frames = batch.partner_frames.cpu().clamp_min(0)
         aligned = (batch.partner_frames >= 0).cpu() & (partner != torch.arange(count))[:, None]
         device = batch.motion.device
-        return Pairing(partner.to(device), places.to(device), aligned.to(device) & batch.window_mask)
-    for clip, other in enumerate(partner.tolist()):
-        same = clip != other and batch.sentences[clip] == batch.sentences[other]
-        if alignments is not None and same and batch.names[clip] != batch.names[other]:
+        return Pairing(partner.to(device), partner_frames.to(device), aligned.to(device) & batch.window_mask)
+    for clip, second_clip in enumerate(partner.tolist()):
+        same = clip != second_clip and batch.sentences[clip] == batch.sentences[second_clip]
+        if alignments is not None and same and batch.names[clip] != batch.names[second_clip]:
             # Dynamic time warping of the speech: two recordings of one sentence differ in timing, and comparing frame
             # by frame would teach the swapped motion the partner's timing.
-            matches = alignments.frames(batch, clip, other)
-            places[clip, : len(matches)] = matches
+            matches = alignments.frames(batch, clip, second_clip)
+            partner_frames[clip, : len(matches)] = matches
             aligned[clip, : len(matches)] = True
     device = batch.motion.device
-    return Pairing(partner.to(device), places.to(device), aligned.to(device))
+    return Pairing(partner.to(device), partner_frames.to(device), aligned.to(device))
 
 
 class Alignments:
@@ -231,27 +231,27 @@ class Alignments:
         self.frame_rate = frame_rate
         self._found: dict[tuple[str, str], Tensor] = {}
 
-    def __call__(self, speech: Tensor, frames: int, other: Tensor, other_frames: int) -> Tensor:
+    def __call__(self, speech: Tensor, frames: int, second_speech: Tensor, second_frames: int) -> Tensor:
         """For each frame of one recording the frame of another one, indices (frames,).
 
         Args:
             speech: of the one recording, (samples,) at 16 kHz.
             frames: motion frames of it.
-            other: speech of the other.
-            other_frames: motion frames of the other.
+            second_speech: of the other.
+            second_frames: motion frames of the other.
         """
         return torch.from_numpy(
             align_features(
                 cepstra(speech.numpy(), frames, self.frame_rate),
-                cepstra(other.numpy(), other_frames, self.frame_rate),
+                cepstra(second_speech.numpy(), second_frames, self.frame_rate),
             )
         )
 
-    def frames(self, batch: Batch, clip: int, other: int) -> Tensor:
+    def frames(self, batch: Batch, clip: int, second_clip: int) -> Tensor:
         """For each valid frame of a clip of the batch the frame of another one, indices (frames,)."""
-        names = (batch.names[clip], batch.names[other])
+        names = (batch.names[clip], batch.names[second_clip])
         if names not in self._found:
-            self._found[names] = self(*self._recording(batch, clip), *self._recording(batch, other))
+            self._found[names] = self(*self._recording(batch, clip), *self._recording(batch, second_clip))
         return self._found[names]
 
     def _recording(self, batch: Batch, clip: int) -> tuple[Tensor, int]:

@@ -68,7 +68,7 @@ class StyleContentOptions:
         basis_size: coefficients of its linear basis, which starts from the principal components of the training motion.
         content_scale: ``clip`` removes mean and spread over a clip from the content of motion, by which a speaker
             would be recognised; ``free`` leaves it as it is.
-        vertices: what the encoders see and the losses compare: all vertices, or the corpus's region ``face``
+        vertices: input of the encoders and of the losses: all vertices, or the corpus's region ``face``
             (``data.face``), e.g. without FLAME's eyeballs. The decoder moves all of them.
         aligned_pairs: where two speakers say the same sentence, supervise a swap of their styles with the other's
             recording, aligned in time; else, and everywhere if False, by the encoders' consistency.
@@ -137,7 +137,7 @@ class StyleContentOptions:
 
     @property
     def weights(self) -> dict[str, float]:
-        """The weight of every term; those of (4.2) are the same terms with the factor ``speech_weight``."""
+        """The weight of every term; the terms of (4.2) have the factor ``speech_weight``."""
         weights = {
             "reconstruction": self.reconstruction_weight,
             "swap": self.swap_weight,
@@ -157,10 +157,10 @@ class StyleContentDisentanglement(AnimationModel):
     Spiral convolutions split motion into content and personal style; one decoder turns content and style into motion,
     whether the content comes from motion or from speech. Chai, Shao, Weng, Zhou, "Personalized Audio-Driven 3D Facial
     Animation via Style-Content Disentanglement", IEEE TVCG 2024; the method is also described in a published patent
-    document, whose steps (4.1) and (4.2) are :meth:`losses`.
+    document; its steps (4.1) and (4.2) are :meth:`losses`.
 
     Args:
-        options: those of :class:`StyleContentOptions` as keyword arguments, and those of every model
+        options: of :class:`StyleContentOptions` as keyword arguments, and of every model
             (:class:`facediff.models.AnimationModel`).
     """
 
@@ -208,7 +208,7 @@ class StyleContentDisentanglement(AnimationModel):
         )
 
     def personal_modules(self) -> list[nn.Module]:
-        """The style encoder, and the decoder, whose basis holds the shapes of a face."""
+        """The style encoder, and the decoder: its basis holds the shapes of a face."""
         return [self.network.style_frames, self.network.style_encoder, self.network.decoder]
 
     def setup(self, stage: str) -> None:
@@ -259,7 +259,7 @@ class StyleContentDisentanglement(AnimationModel):
         content, style = network.content(motion, batch.mask), self.style_of_window(batch, motion)
         reference_style = network.style(batch.reference * self.scale, batch.reference_mask)
         # (4.2) The speech encoder gives content as well, decoded with the style of another clip of the speaker, as
-        # in inference, or with that of the clip itself.
+        # in inference, or with the style of the clip itself.
         speech_content = network.content_of_speech(batch)
         speech_style = style if options.speech_style == "own" else reference_style
         terms = {
@@ -285,13 +285,13 @@ class StyleContentDisentanglement(AnimationModel):
             pairing: the partners.
             content: C_i (B, T, content_dim), from motion or from speech.
             decoded_style: the style (B, style_dim) with which C_i must give M_i.
-            style: S_i of the motion (B, style_dim); S_j is that of the partner.
+            style: S_i of the motion (B, style_dim); S_j is the partner's.
         """
         # All valid frames are seen; those that count are fewer where a training window comes with the frames around it.
-        network, mask, counted, partner = self.network, batch.mask, batch.window_mask, pairing.partner
+        network, mask, scored, partner = self.network, batch.mask, batch.window_mask, pairing.partner
         # D(C_i, S_i) ≈ M_i
         rebuilt = self.decode_scaled(content, decoded_style, mask)
-        terms = {"reconstruction": self.distance_to(batch, rebuilt, motion, counted)}
+        terms = {"reconstruction": self.distance_to(batch, rebuilt, motion, scored)}
         apart = partner != torch.arange(len(partner), device=partner.device)
         if not apart.any():  # no partners: saves two thirds of the work while one speaker alone is trained
             return {**terms, **dict.fromkeys(("swap", "swap_dynamics", "cycle"), motion.new_zeros(()))}
@@ -299,21 +299,21 @@ class StyleContentDisentanglement(AnimationModel):
         # no true motion exists, and content and style that are encoded again must be those that went in.
         swapped = self.decode_scaled(content, style[partner], mask)
         again, style_again = network.content(swapped, mask), self.style_of_window(batch, swapped)
-        # Two people who say the same share the movements of lips and jaw in time, and not those of brows and lids.
+        # Two people who say the same share the movements of lips and jaw in time, but not of brows and lids.
         lower = self.lower_face() if self.options.swap_region == "lower_face" else None
         terms["swap"] = self.distance_to(batch, swapped, pairing.of_partner(motion), pairing.aligned, lower)
-        free = pairing.unaligned
-        # Detached: the swapped motion is to give back the content that went in, and the content must not move towards
-        # what is easy to give back.
-        terms["swap"] = terms["swap"] + relative_distance(again, content.detach(), counted & free[:, None])
+        unaligned = pairing.unaligned
+        # Detached: the swapped motion is to give back the content that went in, and the content must not become
+        # easier to give back.
+        terms["swap"] = terms["swap"] + relative_distance(again, content.detach(), scored & unaligned[:, None])
         target = style[partner].detach()
-        terms["swap"] = terms["swap"] + relative_distance(style_again[:, None], target[:, None], free[:, None])
+        terms["swap"] = terms["swap"] + relative_distance(style_again[:, None], target[:, None], unaligned[:, None])
         # Two people do not blink at the same time, so the upper face has the partner's spread over time, not motion.
         upper = self.assets.regions["upper_face"].to(motion.device)
-        terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], counted, counted[partner], apart, upper)
+        terms["swap_dynamics"] = dynamics_distance(swapped, motion[partner], scored, scored[partner], apart, upper)
         # Swapped back, D(E_C(D(C_i, S_j)), E_S(D(C_j, S_i))) ≈ M_i
         back = self.decode_scaled(again, style_again[partner], mask)
-        terms["cycle"] = self.distance_to(batch, back, motion, counted)
+        terms["cycle"] = self.distance_to(batch, back, motion, scored)
         return terms
 
     def alignment_allowed(self) -> bool:
@@ -332,10 +332,10 @@ class StyleContentDisentanglement(AnimationModel):
             return self.network.style(motion, batch.mask)
         # The encoder reads a sequence from its first frame, so the windows are brought to the front.
         first, lengths = batch.window[:, 0], batch.window_mask.sum(1)
-        places = first[:, None] + torch.arange(int(lengths.max()), device=motion.device)
+        frame_numbers = first[:, None] + torch.arange(int(lengths.max()), device=motion.device)
         rows = torch.arange(len(motion), device=motion.device)[:, None]
-        cut = motion[rows, places.clamp_max(motion.shape[1] - 1)]
-        return self.network.style(cut, frame_mask(lengths, places.shape[1]))
+        cut = motion[rows, frame_numbers.clamp_max(motion.shape[1] - 1)]
+        return self.network.style(cut, frame_mask(lengths, frame_numbers.shape[1]))
 
     def distance_to(
         self, batch: Batch, motion: Tensor, truth: Tensor, mask: Tensor, vertices: Tensor | None = None
@@ -365,7 +365,7 @@ class StyleContentDisentanglement(AnimationModel):
         return lower.nonzero()[:, 0].to(self.device)
 
     def decode_scaled(self, content: Tensor, style: Tensor, mask: Bool[Tensor, "batch frames"]) -> Tensor:
-        """D(C, S): scaled motion (B, T, V, 3); what it is on padding has no meaning."""
+        """D(C, S): scaled motion (B, T, V, 3); undefined on padding."""
         return self.network.decoder(content, style, mask).view(*content.shape[:2], self.n_vertices, self.dims)
 
     def encode_style(
@@ -422,7 +422,7 @@ def graphs_of(model: StyleContentDisentanglement) -> Graphs:
     ratio = Fraction(network.ratio).limit_denominator(1000)
 
     def steps_of(frames: int) -> int:
-        # A step more where the ratio is no whole number: it lies beyond what is valid, and is zero.
+        # A step more where the ratio is no whole number: it lies beyond the valid steps, and is zero.
         return frames * ratio.numerator // ratio.denominator + (ratio.denominator > 1)
 
     speech = speech_graph(model, network.content_of, steps_of)

@@ -76,7 +76,7 @@ class DisentanglementNetwork(nn.Module):
         content = self.content_encoder(self.seen(motion)) * mask[..., None]
         if not self.standardise_content:
             return content
-        # How far somebody opens the mouth is style, not content. Removing each channel's mean and spread over the clip
+        # How far a speaker opens the mouth is style, not content. Removing each channel's mean and spread over the clip
         # takes it away before the decoder could rely on it.
         valid = mask[..., None].to(content.dtype)
         count = valid.sum(1, keepdim=True).clamp_min(1)
@@ -98,15 +98,15 @@ class DisentanglementNetwork(nn.Module):
         return self.content_of(batch, batch.frame_lengths, batch.motion.shape[1])
 
     def content_of(
-        self, heard: Spoken, lengths: Int[Tensor, " batch"], frames: int
+        self, speech: Spoken, lengths: Int[Tensor, " batch"], frames: int
     ) -> Float[Tensor, "batch frames content_dim"]:
         """Content of speech, of ``lengths`` frames each."""
-        cached = heard.cached_features or ()
+        cached = speech.cached_features or ()
         # The encoder gives features at any rate, as if motion had so many frames.
         # Rounded in the same way for every clip, and at least one step, so that a clip's features do not depend on its
         # batch.
         steps = (lengths * self.ratio).round().long().clamp_min(1) if self.ratio != 1 else lengths
-        features = self.audio_encoder(heard.audio, heard.audio_lengths, steps, *cached)
+        features = self.audio_encoder(speech.audio, speech.audio_lengths, steps, *cached)
         content: Tensor = self.speech_content(features, frames, self.ratio, steps)
         return content
 
@@ -256,7 +256,7 @@ class WindowedTransformer(nn.Module):
             features: of the speech.
             frames: frames of motion; as many as features if None.
             ratio: features a frame.
-            lengths: valid features of each clip; those of the longest if None.
+            lengths: valid features of each clip; as many as the longest has if None.
         """
         after = self.window - 1 - self.before
         padded = nn.functional.pad(features, (0, 0, self.before, after))
@@ -283,7 +283,7 @@ class WindowedTransformer(nn.Module):
             features: of the speech.
             frames: frames of motion; as many as features if None.
             ratio: features a frame.
-            lengths: valid features of each clip; those of the longest if None.
+            lengths: valid features of each clip; as many as the longest has if None.
         """
         # Every frame's window is a sequence of its own, so that long clips cost time in proportion to their length.
         windows = self.windows(features, frames, ratio, lengths)
