@@ -137,30 +137,6 @@ class NoiseProcess:
         return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
 
 
-def half_hidden(
-    variances: Float[Tensor, " components"], importance: Float[Tensor, " components"] | None = None
-) -> float:
-    """The scale at which half of the motion's variance shows through the noise of the schedule's middle.
-
-    Where ᾱ = ½, a principal component of variance λ that is noised at the scale b shows the share b²λ / (b²λ + 1) of
-    its variance in a single frame. With less hidden, a model learns to read its input and not the speech.
-
-    Args:
-        variances: of the principal components, as they are noised at the scale 1.
-        importance: what each contributes to the variance of the motion; ``variances`` if None.
-    """
-    own = variances.double()
-    counted = own if importance is None else importance.double()
-    shares = counted / counted.sum()
-    # Bisection, since the share is monotonous in b but has no inverse in closed form for several components.
-    low, high = -60.0, 60.0  # of ln b²; the share that shows rises with it
-    for _ in range(100):
-        middle = (low + high) / 2
-        shown = math.exp(middle) * own
-        low, high = (middle, high) if float((shares * shown / (shown + 1)).sum()) < 0.5 else (low, middle)
-    return math.exp(middle / 2)
-
-
 Spacing = Literal["steps", "log_snr"]
 NoiseLevel = Annotated[float, Range(1e-6, 1e6)]
 Spread = Annotated[float, Range(0.5, 2.0)]
@@ -214,49 +190,6 @@ def visited(
         nearest = min(nearest, chosen[-1] - 1) if chosen else process.steps - 1  # pure noise first
         chosen.append(max(nearest, cleanest + steps - 1 - i))
     return chosen
-
-
-MANY_STEPS = 10
-"""So many steps go to the last noise, whatever number a model is used to: the rule below is of sweeps up to it."""
-
-
-def ended_earlier(first_noise: float, last_noise: float, share: float) -> float:
-    """The noise at which a path of fewer steps ends best.
-
-    What a step at little noise adds are details of a sample, and only where the steps before it have got near: two
-    steps, one at full noise and one at the last noise of ten, give the mean motion with what the noise leaks into it.
-    The path in ln SNR is shortened by the square root of the share of steps, near the best ends of sweeps with two to
-    five steps, around which scores are flat; docs/generation.md has what it gives.
-
-    Args:
-        first_noise: from which steps are spread evenly in ln SNR.
-        last_noise: at which the usual number of steps ends.
-        share: of the steps that go to the last noise.
-
-    >>> [round(ended_earlier(2000.0, 10.0, steps / 10)) for steps in (2, 3, 5, 10, 20)]
-    [187, 110, 47, 10, 10]
-    """
-    if share >= 1:
-        return last_noise
-    return float(first_noise * (last_noise / first_noise) ** math.sqrt(max(0.0, share)))
-
-
-def widened(first_noise: float, last_noise: float, share: float) -> float:
-    """The :attr:`Sampler.spread` that lets few steps vary as much as the usual number.
-
-    A path that ends at more noise shows less of what the conditions leave open: by 1 + 8 (noise − usual noise) / first
-    noise, within 8 % of a sweep with two to eight steps of the bundled model (docs/generation.md). The factor is the
-    root of it, since it counts twice.
-
-    Args:
-        first_noise: from which steps are spread evenly in ln SNR.
-        last_noise: at which the usual number of steps ends.
-        share: of the steps that go to the last noise.
-
-    >>> [round(widened(2000.0, 10.0, steps / 10), 2) for steps in (2, 3, 5, 10, 20)]
-    [1.31, 1.18, 1.07, 1.0, 1.0]
-    """
-    return math.sqrt(1 + 8 * (ended_earlier(first_noise, last_noise, share) - last_noise) / first_noise)
 
 
 PART = 2**21
