@@ -68,7 +68,7 @@ class Conditions:
         """The conditions of some of the frames, with nothing prepared."""
         return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end], shares=self.shares)
 
-    def masks(self, times: int) -> Conditions:
+    def for_draws(self, times: int) -> Conditions:
         """The conditions of several noisy versions of every clip, clip by clip."""
         audio, style, mask = (value.repeat_interleave(times, 0) for value in (self.audio, self.style, self.mask))
         return Conditions(audio, style, mask, shares=self.shares)
@@ -78,7 +78,7 @@ class Conditions:
         if times == 1:
             return self
         if len(self.shares) > 1:
-            return self.drawn(times)
+            return self.for_draws(times)
         audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
         return Conditions(audio, style, self.mask.expand(times, -1))
 

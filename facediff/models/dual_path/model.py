@@ -241,7 +241,7 @@ class DualPathDiffusion(Generation):
         noisy = objective.inputs(noise)  # ③ Mⁿ by eq. 1
         motion = self.network.embed(noisy)  # ⑤ F_m
         # ⑥ up to the last map, which makes M̂⁰: it is computed together with the losses.
-        decoded = self.network.core(motion, step, conditions if draws == 1 else conditions.drawn(draws))
+        decoded = self.network.core(motion, step, conditions if draws == 1 else conditions.for_draws(draws))
         losses = objective.losses(decoded)  # ⑦ eq. 15 to 19
         if self.style_identity is not None and conditions.dynamic is not None:  # ours; it depends on F_dyn alone
             term = style_identity_loss(self.style_identity(conditions.dynamic), batch.identity)
