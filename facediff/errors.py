@@ -34,7 +34,7 @@ def counted(value: int, one: str, many: str | None = None) -> str:
 
 
 def choices(name: str, candidates: Iterable[str]) -> str:
-    """What follows "there is no …": the nearest of the known names, then all of them, unless they are very many."""
+    """The words after "there is no …": the nearest of the known names, then all of them, unless they are very many."""
     names = list(candidates)
     near = difflib.get_close_matches(name, names, n=1)
     hint = f'did you mean "{near[0]}"? ' if near else ""
@@ -45,15 +45,15 @@ def choices(name: str, candidates: Iterable[str]) -> str:
 
 
 def lacking(cls: object) -> str:
-    """What is wrong with a class that leaves abstract methods undefined; empty if it leaves none.
+    """The fault of a class with undefined abstract methods; empty if it has none.
 
     Example:
         >>> from collections.abc import Sized
         >>> lacking(Sized), lacking(list)
-        ('the class lacks __len__; define what it lacks', '')
+        ('the class lacks __len__; define them', '')
     """
     names = sorted(getattr(cls, "__abstractmethods__", ()))
-    return f"the class lacks {', '.join(names)}; define what it lacks" if names else ""
+    return f"the class lacks {', '.join(names)}; define them" if names else ""
 
 
 def import_failure(error: BaseException) -> str:
@@ -85,7 +85,11 @@ def printable(text: object) -> str:
 
 
 LONGEST = 1400
-"""Characters of a message. What a damaged file holds may be quoted in one, and that can be megabytes."""
+"""Characters of a message, which may quote a damaged file of megabytes."""
+
+
+LONGEST_REASON = 200
+"""Characters of a library's own words in a message."""
 
 
 def shortened(text: str) -> str:
@@ -96,7 +100,7 @@ def shortened(text: str) -> str:
 class FaceDiffError(Exception):
     """Something that the user can put right: a file, an argument or an installation.
 
-    The message names the file or the field, says what was expected and what to do next. The command line
+    The message names the file or the field, the expectation and the next step. The command line
     prints it without a traceback and exits with code 2.
     """
 
@@ -108,9 +112,9 @@ class FaceDiffError(Exception):
         """The message with options as the command line calls them."""
         return str(self)
 
-    def within(self, place: object) -> FaceDiffError:
+    def within(self, location: object) -> FaceDiffError:
         """The same error with the place it comes from, such as a file and its line, in front of the message."""
-        return FaceDiffError(f"{place}: {self}")
+        return FaceDiffError(f"{location}: {self}")
 
     def followed_by(self, hint: str) -> FaceDiffError:
         """The same error with a hint after it; options in the hint stand in braces."""
@@ -128,7 +132,7 @@ class OptionError(FaceDiffError):
 
     Args:
         option: name of the option as in Python; empty if the message is about something else.
-        problem: what is wrong, what was expected, what to do. Other options stand in braces: "give {style} as well".
+        problem: the fault, the expectation and the remedy. Other options stand in braces: "give {style} as well".
         value: the wrong value, if it is to be shown.
         place: where the option was read, if not from the user directly: stands in front of the message.
 
@@ -140,8 +144,8 @@ class OptionError(FaceDiffError):
         --target-mesh face.obj: no such file; omit --correspondence too
     """
 
-    def __init__(self, option: str, problem: str, value: object = None, *, place: str = "") -> None:
-        self.problem, self.value, self.place = problem, value, place
+    def __init__(self, option: str, problem: str, value: object = None, *, location: str = "") -> None:
+        self.problem, self.value, self.place = problem, value, location
         self.option = option or next(iter(_OPTION_NAME.findall(problem)), "")
         self._in_front = option
         super().__init__(self._sentence(str))
@@ -161,13 +165,13 @@ class OptionError(FaceDiffError):
         """The message with options as the command line calls them."""
         return shortened(printable(self._sentence(lambda name: f"--{name.replace('_', '-')}")))
 
-    def within(self, place: object) -> OptionError:
+    def within(self, location: object) -> OptionError:
         """The same error with the place it comes from in front of the message."""
-        return OptionError(self._in_front, self.problem, self.value, place=f"{place}: {self.place}")
+        return OptionError(self._in_front, self.problem, self.value, location=f"{location}: {self.place}")
 
     def followed_by(self, hint: str) -> OptionError:
-        """The same error with a hint after it, whose options stand in braces."""
-        return OptionError(self._in_front, self.problem + hint, self.value, place=self.place)
+        """The same error with a hint after it; options in it stand in braces."""
+        return OptionError(self._in_front, self.problem + hint, self.value, location=self.place)
 
     def _sentence(self, spelled: Callable[[str], str]) -> str:
         value = "" if self.value is None else f" {self.value}"
@@ -177,18 +181,18 @@ class OptionError(FaceDiffError):
     def __reduce__(self) -> tuple[Callable[..., OptionError], tuple[str, str, str | None]]:
         """Pickling, by which worker processes hand errors over."""
         value = None if self.value is None else str(self.value)
-        return partial(OptionError, place=self.place), (self._in_front, self.problem, value)
+        return partial(OptionError, location=self.place), (self._in_front, self.problem, value)
 
 
 class ArgumentError(FaceDiffError, ValueError):
     """A constructor's argument has an impossible value, or one that does not go with another argument's.
 
-    Where it is raised, only the argument's own name is known. Whoever called that constructor knows which option it is,
+    Where it is raised, only the argument's own name is known. The caller of that constructor knows which option it is,
     and replaces the name by a path such as ``model.decoder.num_heads``; the command line writes it as an option.
 
     Args:
         values: the arguments with their values.
-        problem: what was expected, and what to do.
+        problem: the expectation and the remedy.
         located: whether the names are paths already.
     """
 
@@ -205,8 +209,8 @@ class ArgumentError(FaceDiffError, ValueError):
             text = "null" if value is None else str(value) or '""'
             return text if len(text) <= 60 else f"{text[:60]}…"
 
-        named = " with ".join(f"{prefix}{name} {shown(value)}" for name, value in self.values.items())
-        return f"{named}: {self.problem}"
+        arguments = " with ".join(f"{prefix}{name} {shown(value)}" for name, value in self.values.items())
+        return f"{arguments}: {self.problem}"
 
     def at(self, path: Callable[[str], str]) -> ArgumentError:
         """The same error with a path in place of each name."""
@@ -223,12 +227,12 @@ class NotFiniteError(FaceDiffError, ValueError):
 
 
 class MissingExtraError(FaceDiffError):
-    """A feature was used whose optional packages are not installed.
+    """The optional packages of a feature are not installed.
 
     Args:
-        package: import name of what is missing.
+        package: import name of the missing package.
         extra: the extra of facediff that brings it.
-        feature: what needs it, in words.
+        feature: the feature that needs it, in words.
     """
 
     def __init__(self, package: str, extra: str, feature: str) -> None:
@@ -244,11 +248,7 @@ class MissingExtraError(FaceDiffError):
 
 @contextmanager
 def needs_extra(package: str, extra: str, feature: str) -> Iterator[None]:
-    """A context that imports an optional package, or says how to install it; the arguments are those of the error.
-
-    Raises:
-        MissingExtraError: if it is not installed.
-    """
+    """A context that imports an optional package; :class:`MissingExtraError` says how to install a missing one."""
     try:
         yield
     except ImportError as error:
@@ -256,18 +256,17 @@ def needs_extra(package: str, extra: str, feature: str) -> Iterator[None]:
 
 
 @contextmanager
-def damaged(source: object, remedy: str) -> Iterator[None]:
+def damaged(source: object, remedy: str, *errors: type[Exception]) -> Iterator[None]:
     """The door of a file: within it, content of another form than expected is an error that names the file.
 
-    The code inside takes what it needs (``content["sizes"][0]``) and raises ValueError for what would be taken
-    without a word; it needs no check for what Python refuses by itself.
+    The code inside takes its fields (``content["sizes"][0]``) and raises ValueError for values that would otherwise
+    pass without a word; it needs no check where Python refuses by itself.
 
     Args:
         source: the file, or a part of it.
         remedy: what to do about it.
-
-    Raises:
-        FaceDiffError: in place of the exceptions by which Python refuses keys, indices, types and values.
+        errors: exceptions of the library that reads it, beyond those by which Python refuses keys, indices, types and
+            values; all become a :class:`FaceDiffError`.
 
     Example:
         >>> with damaged("take.json", "export it again"):
@@ -275,10 +274,20 @@ def damaged(source: object, remedy: str) -> Iterator[None]:
         Traceback (most recent call last):
         facediff.errors.FaceDiffError: take.json: has no 'frames'; export it again
     """
+    refusals: tuple[type[Exception], ...] = (
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        *errors,
+    )
     try:
         yield
     except FaceDiffError as error:
-        raise error if str(source) in str(error) else error.within(source) from error
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        problem = f"has no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise FaceDiffError(f"{source}: {problem}; {remedy}") from error
+        located = isinstance(error, MissingExtraError) or str(source) in str(error)
+        raise error if located else error.within(source) from error
+    except refusals as error:
+        problem = " ".join(str(getattr(error, "strerror", None) or error).split()) or type(error).__name__
+        problem = f"has no {problem}" if isinstance(error, KeyError) else problem
+        raise FaceDiffError(f"{source}: {problem[:LONGEST_REASON]}; {remedy}") from error

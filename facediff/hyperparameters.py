@@ -12,7 +12,7 @@ from dataclasses import fields, replace
 from enum import Enum
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from facediff.errors import FaceDiffError
 from facediff.registry import COMPONENTS, alias_path
@@ -20,7 +20,10 @@ from facediff.utils import hints
 from facediff.utils.hints import checks_arguments, defaults, is_path, options_of
 from facediff.utils.limits import quoted
 
-Options = TypeVar("Options")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Options = TypeVar("Options", bound="DataclassInstance")
 
 Components = Mapping[str, Callable[[str], type | None]]
 """For each kind of component, what finds a class by its import path; None if it is not known."""
@@ -150,24 +153,19 @@ def read_options(source: str, owner: type, options: Mapping[str, Any], component
 
 
 def read_component(source: str, name: str, value: object, components: Components) -> partial[Any] | None:
-    """A component that a file states; None where a model leaves it out.
-
-    Raises:
-        FaceDiffError: if it is not a known component of its kind with plain options.
-    """
+    """A component that a file states, of a known class with plain options; None where a model leaves it out."""
     if value is None:
         return None
-    if not isinstance(value, dict) or not {"class_path"} <= value.keys() <= {"class_path", "init_args"}:
+    content = value if isinstance(value, dict) else {}
+    options = content.get("init_args", {})
+    if not isinstance(options, dict) or not {"class_path"} <= content.keys() <= {"class_path", "init_args"}:
         raise FaceDiffError(
             f"{source}: its {name} is {quoted(value)}; expected a component with its class and options; it was not "
             f"loaded"
         )
-    component = components[name](value["class_path"]) if is_path(value["class_path"]) else None
+    component = components[name](content["class_path"]) if is_path(content["class_path"]) else None
     if component is None:
-        raise unknown_class(source, name, value["class_path"])
-    options = value.get("init_args", {})
-    if not isinstance(options, dict):
-        raise FaceDiffError(f"{source}: the options of its {name} are {quoted(options)}; expected a dict")
+        raise unknown_class(source, name, content["class_path"])
     return partial(component, **read_options(source, component, options, components))
 
 

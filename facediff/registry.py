@@ -46,7 +46,7 @@ class Entry:
     """One registered class.
 
     Attributes:
-        name: what chooses it.
+        name: by which it is chosen.
         implementation: the class.
     """
 
@@ -69,10 +69,10 @@ class Kind:
     """The components of one kind, by name.
 
     Args:
-        name: what the kind is called.
+        name: of the kind.
         modules: import paths of the modules that register the built-in ones, separated by spaces.
-        title: what an entry of this kind does, in a few words.
-        component: whether models are made of it; its options are then checked as those of the model.
+        title: purpose of an entry of this kind, in a few words.
+        component: whether models are made of it; its options are then checked as options of the model.
     """
 
     def __init__(self, name: str, modules: str, title: str, *, component: bool = False) -> None:
@@ -84,12 +84,7 @@ class Kind:
         self._loaded = False
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Class decorator that registers a component under ``name``.
-
-        Raises:
-            RegistrationError: if the name is not a lower-snake-case identifier, is reserved, or is taken by
-                another class; the message names both owners.
-        """
+        """Class decorator that registers a component under ``name``, which no other class of its kind may have."""
 
         def decorate(implementation: T) -> T:
             self._add(name, implementation)
@@ -103,21 +98,20 @@ class Kind:
         malformed = malformed or (self.component and name != name.lower())
         if malformed or name in dir(self):
             raise RegistrationError(
-                f'{self.kind} name "{name}" cannot be registered: use a lower snake case identifier that is none '
-                f"of the registry's own words"
+                f'{self.kind} name "{name}" cannot be registered: use a lower snake case identifier that is no '
+                f"attribute of the registry"
             )
         if not isinstance(implementation, type):
             raise RegistrationError(f'{self.kind} "{name}" is {implementation!r:.80}, which is no class')
-        owner = f"{implementation.__module__}.{implementation.__qualname__}"
-        taken = self._entries.get(name)
-        if taken is not None and taken.owner != owner:
+        entry, present = Entry(name, implementation), self._entries.get(name)
+        if present is not None and present.owner != entry.owner:
             raise RegistrationError(
-                f'{self.kind} name "{name}" is wanted by {owner} but belongs to {taken.owner}: rename one of them'
+                f'{self.kind} name "{name}" is wanted by {entry.owner} but belongs to {present.owner}: rename one'
             )
-        if self.component and "__init__" in vars(implementation) and taken is None:
-            own: Any = implementation
-            own.__init__ = hints.checks_arguments(own.__init__, f"model.{self.kind}", sizes="model")
-        self._entries[name] = Entry(name, implementation)
+        if self.component and "__init__" in vars(implementation) and present is None:
+            component: Any = implementation
+            component.__init__ = hints.checks_arguments(component.__init__, f"model.{self.kind}", sizes="model")
+        self._entries[name] = entry
 
     def load(self) -> None:
         """Import the built-in components and the installed plug-ins, once; another thread waits for them."""
@@ -168,30 +162,30 @@ class Kind:
         return name, self.options(name, pairs, f"{self.kind} {text}", hidden)
 
     def options(
-        self, name: str, pairs: Sequence[tuple[str, str]], shown: str, hidden: Set[str] = frozenset()
+        self, name: str, pairs: Sequence[tuple[str, str]], source: str, hidden: Set[str] = frozenset()
     ) -> dict[str, Any]:
         """The options of a component as its constructor takes them.
 
         Args:
             name: of the component.
             pairs: options and their values, as typed.
-            shown: what errors call the option in which they stand.
+            source: the name of their option in errors.
             hidden: options that cannot be chosen this way.
         """
         component = self.get(name)
         names = inspect.signature(component).parameters.keys() - hidden
-        known = {option: p for option, p in hints.options_of(component).items() if option in names}
-        known = {option: p for option, p in known.items() if p.default is not p.empty}
+        parameters = {option: p for option, p in hints.options_of(component).items() if option in names}
+        parameters = {option: p for option, p in parameters.items() if p.default is not p.empty}
         options = {}
         for option, value in pairs:
-            if option not in known:
-                offered = choices(option, known) if known else "it has none"
-                raise FaceDiffError(f"{shown}: {name} has no option {option!r}: {offered}")
-            hint, default = known[option].annotation, known[option].default
+            if option not in parameters:
+                offered = choices(option, parameters) if parameters else "it has none"
+                raise FaceDiffError(f"{source}: {name} has no option {option!r}: {offered}")
+            hint, default = parameters[option].annotation, parameters[option].default
             try:
                 options[option] = hints.read(type(default) if hint is Any and default is not None else hint, value)
             except ValueError as error:
-                raise FaceDiffError(f"{shown}: option {option} is {value!r}; expected {error}") from error
+                raise FaceDiffError(f"{source}: option {option} is {value!r}; expected {error}") from error
         return options
 
     def unknown(self, name: str) -> str:
@@ -345,7 +339,7 @@ def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a
     Args:
         kind: where it may be registered; its entries are imported first, so that a plug-in is found.
         path: the import path.
-        base: what the class must be a subclass of.
+        base: required base class.
     """
     if not isinstance(path, str) or not hints.is_path(path):
         return None
@@ -353,14 +347,11 @@ def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a
     if module == f"facediff.registry.{kind.kind}":
         return kind.get(name) if name in kind.names() else None
     kind.load()
-    # The module must be imported already: importing what a file names would run code that the file chose.
+    # The module must be imported already: importing a module that a file names would run code of the file's choice.
     # Not getattr, which may make a lazily loaded package import the module that the file asks for.
-    place = sys.modules.get(module)
-    implementation = vars(place).get(name) if isinstance(place, types.ModuleType) else None
+    imported = sys.modules.get(module)
+    implementation = vars(imported).get(name) if isinstance(imported, types.ModuleType) else None
     if not isinstance(implementation, type):
         return None
-    return (
-        implementation
-        if issubclass(implementation, base) or implementation in [entry.implementation for entry in kind]
-        else None
-    )
+    accepted = issubclass(implementation, base) or implementation in [entry.implementation for entry in kind]
+    return implementation if accepted else None

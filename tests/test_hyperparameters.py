@@ -1,4 +1,4 @@
-"""Options in a dataclass: the same options, documented, checked and stored as if they were arguments of a constructor."""
+"""Options in a dataclass: as if they were arguments of a constructor, documented, checked and stored the same way."""
 
 from __future__ import annotations
 

@@ -40,16 +40,6 @@ def test_the_pythons_that_are_tested_are_those_that_are_claimed() -> None:
     assert read(".github/workflows/release.yml")["jobs"]["packages"]["strategy"]["matrix"]["python"] == named
 
 
-def test_the_release_check_uses_every_extra_that_the_workflow_names() -> None:
-    (command,) = [
-        words
-        for step in read(".github/workflows/release.yml")["jobs"]["packages"]["steps"]
-        if (words := step.get("run", "").split())[:2] == ["python", "tools/release_check.py"]
-    ]
-    extras = command[command.index("--extras") + 1 :]
-    assert {*extras} - {"base"} <= {*PROJECT["project"]["optional-dependencies"]}
-
-
 @pytest.mark.parametrize("extra", ["metrics", "train", "render", "prepare", "mesh", "figures", "live", "serve", "docs"])
 def test_what_an_extra_needs_is_pinned(extra: str) -> None:
     needs = [re.split(r"[\[<>=]", need)[0] for need in PROJECT["project"]["optional-dependencies"][extra]]
@@ -73,11 +63,3 @@ def test_the_source_distribution_holds_what_there_is() -> None:
     }
     assert ours <= included
     assert (ROOT / "facediff" / "py.typed").exists()
-
-
-@pytest.mark.parametrize("form", ["mistake", "wish"])
-def test_issue_forms_ask_named_questions(form: str) -> None:
-    body = read(f".github/ISSUE_TEMPLATE/{form}.yml")["body"]
-    asked = [question for question in body if question["type"] != "markdown"]
-    assert len({question["id"] for question in asked}) == len(asked) > 0
-    assert all(question["attributes"]["label"] for question in asked)

@@ -14,7 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from facediff import registry
-from facediff.hyperparameters import component_class, describe, plain
+from facediff.hyperparameters import describe, plain
 from facediff.models.decoders import GruDecoder
 
 
@@ -81,14 +81,6 @@ def test_plain_forms_survive_a_checkpoint(value: Any, expected: Any, tmp_path: P
     assert torch.load(tmp_path / "hparams.pt", weights_only=True) == expected
 
 
-@pytest.mark.parametrize(
-    "value", [object(), lambda: 0, b"bytes", 1j, torch.nn.Linear(1, 1), {"deep": [object()]}, partial(len)]
-)
-def test_what_has_no_plain_form_raises(value: Any) -> None:  # noqa: ANN401
-    with pytest.raises(TypeError, match="give"):
-        plain(value)
-
-
 def test_a_description_rebuilds_the_component() -> None:
     factory = partial(registry.decoder.gru, num_layers=1, bidirectional=False)
     description = describe(factory, factory(dim=3, style_dim=2))
@@ -107,15 +99,6 @@ def test_a_component_may_add_to_its_description() -> None:
     description = describe(partial(registry.decoder.gru, num_layers=1), Loaded())
     usual = {"bidirectional": True, "dropout": 0.1}
     assert description["init_args"] == {"num_layers": 1, **usual, "config": {"width": 4, "path": "x"}}
-
-
-def test_the_class_behind_a_factory() -> None:
-    assert component_class(GruDecoder) is GruDecoder
-    assert component_class(partial(partial(GruDecoder, num_layers=1), dropout=0.0)) is GruDecoder
-    # jsonargparse hands over a partial of a function with the class among its arguments.
-    assert component_class(partial(print, GruDecoder)) is GruDecoder
-    with pytest.raises(TypeError, match="is no component"):
-        component_class("gru")
 
 
 def test_options_left_at_their_defaults_are_written_down_too() -> None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import re
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, TypedDict, TypeVar
+from typing import Any, TypedDict, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation.animation import Animation, Channels, MotionMap, stretches_of
+from facediff.animation.animation import Animation, Channels
 from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays
@@ -83,8 +82,7 @@ def read_animation(
     if path.suffix != ".npy":
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in .npz or .npy')
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused before it is used
-        stored = open_vertices(path)
-        vertices = stored.view(MotionMap) if stored.dtype == np.float32 else stored.astype(np.float32)
+        vertices = open_vertices(path).astype(np.float32, copy=False)
     facts = complete(overrides, defaults)
     if "frame_rate" not in facts:
         raise OptionError.naming(f"{path}: an array has no frame rate; give {{frame_rate}} or {{checkpoint}}")
@@ -145,16 +143,8 @@ def write_archive(path: Path, animation: Animation) -> None:
         **space,
     }
     arrays["about"] = np.array(json_text(path, about, indent=None))
-    with atomic(path) as temporary, zipfile.ZipFile(temporary, "w", allowZip64=True) as archive:
-        for name, array in arrays.items():
-            # As numpy.savez does, but for a motion in a file, which is never read as a whole.
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
-                if isinstance(array, MotionMap):
-                    write_header(stream, array.shape)
-                    for _, vertices in stretches_of(array):
-                        stream.write(np.ascontiguousarray(vertices, "<f4").tobytes())
-                else:
-                    np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
 
 
 def read_archive(path: Path) -> Animation:
@@ -234,7 +224,7 @@ class MotionWriter:
         self.frame = frame
         self.frames = 0  # written so far
         self._stream = path.open("wb")
-        write_header(self._stream, (0, *frame))
+        self._write_header()
 
     def write(self, vertices: npt.NDArray[np.float32]) -> None:
         """Add frames (n, V, 3)."""
@@ -245,9 +235,9 @@ class MotionWriter:
         """Write the number of frames into the header."""
         with self._stream:
             self._stream.seek(0)
-            write_header(self._stream, (self.frames, *self.frame))
+            self._write_header()
 
-
-def write_header(stream: IO[bytes], shape: tuple[int, ...]) -> None:
-    """The beginning of a .npy file of float32, which may be overwritten: NumPy leaves room for more frames."""
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    def _write_header(self) -> None:
+        # NumPy leaves room for the first number of a shape to grow, so that the header may be overwritten in its place.
+        facts = {"descr": "<f4", "fortran_order": False, "shape": (self.frames, *self.frame)}
+        np.lib.format.write_array_header_1_0(self._stream, facts)

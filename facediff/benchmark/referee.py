@@ -28,7 +28,7 @@ from facediff.metrics import (
 from facediff.metrics.mouth import opening
 from facediff.speech.phonemes import TimedPhoneme, closures
 from facediff.synthetic.spoken_set import LANGUAGES, OpenFace, SpokenClip, SpokenMotion, open_face, reference
-from facediff.utils.lags import correlations, peak
+from facediff.utils.cross_correlation import correlations, peak
 
 Array = npt.NDArray[np.float64]
 

@@ -68,7 +68,7 @@ class Setting:
     classes: Mapping[str, str] = field(default_factory=dict)
     models: Mapping[str, str] = field(default_factory=dict)
     roots: Mapping[str, str] = field(default_factory=dict)
-    launcher: tuple[str, ...] = (sys.executable, "-m", "facediff.utils.tethered", "facediff")
+    launcher: tuple[str, ...] = (sys.executable, "-m", "facediff.benchmark.exit_with_parent", "facediff")
 
 
 def pending(cells: Sequence[Cell], folder: Path, *, retry_failed: bool) -> list[Cell]:

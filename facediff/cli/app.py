@@ -250,7 +250,7 @@ def missing_extra(name: str, package: str, extra: str = "", feature: str = "") -
 
 def run(name: str, arguments: Sequence[str]) -> int:
     """Import a command and run it with its arguments."""
-    from facediff.utils.destinations import reading
+    from facediff.utils.output_paths import reading
 
     function = load(name)
     with reading():  # files that the parser takes as inputs are not overwritten until the command has ended

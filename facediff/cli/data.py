@@ -6,6 +6,7 @@ import importlib
 import inspect
 import json as json_format
 import os
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,12 +17,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from facediff.cli.options import Corpus, File, FileOrList, FrameRate, OutputFolder, Scheduler, Size, Workers
 from facediff.cli.parsing import Parameters, parameters_of, parse
 from facediff.cli.process import tell
+from facediff.data import prepare as prepare_package
 from facediff.errors import FaceDiffError, choices, counted, printable
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
-    from facediff.data.prepare.runner import PreparationPlan, PreparationReport
+    from facediff.data.preparation import PreparationPlan, PreparationReport
 
 Root = Annotated[Path, Option(reads=True, exists="folder")]
 
@@ -90,8 +92,8 @@ def check(
 
     Args:
         root: the corpus folder, or a packed corpus: its folder or its address
-        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, beat, live_link,
-            flame_clips:LAYOUT, or package.module.Class
+        corpus: the corpus, if it is not recognised: a name of `facediff components corpus`, flame_clips:LAYOUT, or
+            package.module.Class
         quick: read headers only, and compare files by size
         json: machine-readable: one object
         work: where the work is done
@@ -118,7 +120,7 @@ def check(
 
 # ``facediff data prepare``: the options of a corpus are the keyword parameters of its plan.
 
-CORPORA = ("biwi", "vocaset", "mead3d")
+CORPORA = tuple(module.name for module in pkgutil.iter_modules(prepare_package.__path__))
 """Modules of :mod:`facediff.data.prepare`; each has a ``plan(raw, *, …)`` whose keyword parameters are its options."""
 PREPARE = """usage: facediff data prepare <corpus> RAW OUT [options]
 
@@ -144,7 +146,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
         raise FaceDiffError(f"{out}: lies in the raw folder {raw}; choose a folder outside it to write to")
     if "quiet" in inspect.signature(module.plan).parameters:  # a long scan has a progress bar
         values["quiet"] = work.quiet
-    from facediff.data.prepare.runner import prepare
+    from facediff.data.preparation import prepare
 
     with resumable(out):
         report = prepare(module.plan(raw, **values), out, reads=[raw], **vars(work))
@@ -224,7 +226,7 @@ def pack(
     Args:
         root: the corpus folder
         out: packed corpus to write (OUT.zarr): a new one, or one that this command has begun
-        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, or package.module.Class
+        corpus: the corpus, if it is not recognised: a name of `facediff components corpus`, or package.module.Class
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size
         exact: keep test clips and their style references bit for bit, so that scores stay the same; or none
@@ -402,7 +404,7 @@ def regions(
     Args:
         root: the corpus folder
         output: the picture (.png)
-        corpus: the corpus, if it is not recognised: biwi, vocaset, mead3d, puppet, puppet_mask, or package.module.Class
+        corpus: the corpus, if it is not recognised: a name of `facediff components corpus`, or package.module.Class
         lips: file in the folder, e.g. regions/lve.txt or FLAME_masks.pkl:lips (default: the corpus's own)
         upper_face: file in the folder, e.g. regions/fdd.txt or FLAME_masks.pkl:forehead+eye_region (default: the
             corpus's own)

@@ -50,7 +50,7 @@ class FileOptions:
         pattern: how predictions are named, repeatable (see `facediff evaluate`)
         truth_pattern: how truths are named (default: {subject}_{sentence})
         identity: whose style predictions were given: own, or an identity's name
-        topology: biwi, vocaset, mead3d, puppet, puppet_mask, or package.module.Class
+        topology: a name of `facediff components corpus`, or package.module.Class
         templates: templates.pkl, each speaker's neutral face
         mesh: .ply or .obj with the faces
         frame_rate: frames a second of the predictions

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from facediff.errors import FaceDiffError
-from facediff.utils.destinations import protect, refuse_equal, refuse_overwriting
 from facediff.utils.files import check_folder_writable, check_writable
 from facediff.utils.option import Option
+from facediff.utils.output_paths import protect, refuse_equal, refuse_overwriting
 
 
 class Parameter(Protocol):

@@ -150,7 +150,7 @@ def tracked_style(video: Path, checkpoint: Path | str, identity: str | None) -> 
     import numpy as np
 
     import facediff
-    from facediff.data.prepare.runner import write_mesh
+    from facediff.data.preparation import write_mesh
     from facediff.data.track.corpus import track_people
     from facediff.utils.arrays import ArrayStore
     from facediff.utils.checksums import sha256

@@ -23,12 +23,12 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
-from facediff.registry import UnknownComponentError, augmentation
+from facediff.registry import augmentation
 from facediff.speech.audio import fit_length
 from facediff.speech.pitch import SIZE, Wave, shifted, signal, spectra, stretched
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hints import checks_arguments
+from facediff.utils.numerics import smooth_step
 from facediff.utils.ranges import Range
 
 Share = Annotated[float, Range(0, 1)]
@@ -135,14 +135,8 @@ def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
         >>> [type(change).__name__ for change in read_augmentations(["voice:semitones=3", "room"])]
         ['Voice', 'Room']
     """
-    augmentations = []
-    for text in texts:
-        try:
-            name, options = augmentation.read(text)
-        except UnknownComponentError as error:
-            raise FaceDiffError(f"data.augmentations: {error}") from error
-        augmentations.append(cast(Augmentation, augmentation.get(name)(**options)))
-    return augmentations
+    pairs = (augmentation.read(text) for text in texts)
+    return [cast(Augmentation, augmentation.get(name)(**options)) for name, options in pairs]
 
 
 # Voices.
@@ -210,9 +204,9 @@ class Speed(Augmentation):
         after = max(2, round(before / (1 + self.ratio) ** random.uniform(-1, 1)))
         if before < 2 or after == before:
             return example
-        places = (np.arange(after) + 0.5) * (before / after) - 0.5
-        low = np.clip(np.floor(places).astype(int), 0, before - 2)
-        share = np.clip(places - low, 0.0, 1.0).astype(np.float32)[:, None, None]
+        positions = (np.arange(after) + 0.5) * (before / after) - 0.5
+        low = np.clip(np.floor(positions).astype(int), 0, before - 2)
+        share = np.clip(positions - low, 0.0, 1.0).astype(np.float32)[:, None, None]
         motion = (1 - share) * example.motion[low] + share * example.motion[low + 1]
         length = round(after * SAMPLE_RATE / example.frame_rate)
         speech = stretched(example.speech, length / max(1, len(example.speech)))
@@ -313,8 +307,8 @@ class Codec(SpeechAugmentation):
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Encode and decode."""
-        chosen = ("telephone", "vorbis")[int(random.integers(2))] if self.kind == "any" else self.kind
-        return telephone(speech) if chosen == "telephone" else vorbis(speech, float(random.uniform(0.5, 1.0)))
+        kind = ("telephone", "vorbis")[int(random.integers(2))] if self.kind == "any" else self.kind
+        return telephone(speech) if kind == "telephone" else vorbis(speech, float(random.uniform(0.5, 1.0)))
 
 
 # Rooms and noise.
@@ -429,8 +423,8 @@ class Hum(Background):
 class Babble(Background):
     """Other people who talk in the background.
 
-    They are copies of the clip itself from random places, faster or slower and half of them backwards, so that nothing
-    that they say fits the motion.
+    They are copies of the clip itself from random places, faster or slower and half of them backwards, so that their
+    words do not fit the motion.
 
     Args:
         share: of the augmented clips.
@@ -502,31 +496,26 @@ class Pauses(Augmentation):
     def __call__(self, example: Example, random: np.random.Generator) -> Example:
         """The clip with a pause."""
         frames, rate = len(example.motion), example.frame_rate
-        whole = random.random() < self.silent
+        silent_clip = random.random() < self.silent
         length = min(random.uniform(0.3, self.seconds), 0.7 * frames / rate)
         # Often at either end of the clip: where speech begins out of silence is where onsets are learnt.
         start = float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (frames / rate - length)
-        first, last = (-1e9, 1e9) if whole else (start, start + length)
+        first, last = (-1e9, 1e9) if silent_clip else (start, start + length)
         if start <= 0:
             first = -1e9
         elif start >= frames / rate - length:
             last = 1e9
         middles = (np.arange(frames) + 0.5) / rate
-        at_rest = np.minimum(_step((middles - first) / CLOSING), _step((last - middles) / OPENING)).astype(np.float32)
+        closing, opening = smooth_step((middles - first) / CLOSING), smooth_step((last - middles) / OPENING)
+        at_rest = np.minimum(closing, opening).astype(np.float32)
         weight = at_rest[:, None, None] * example.mouth[None, :, None]
         motion = example.motion + weight * (example.rest - example.motion)
         times = np.arange(len(example.speech)) / SAMPLE_RATE
-        said = 1 - np.clip(np.minimum((times - first) / 0.02, (last - times) / 0.02), 0, 1)
+        gain = 1 - np.clip(np.minimum((times - first) / 0.02, (last - times) / 0.02), 0, 1)
         # Faint and not zero: `noise` and `hum` scale with the power of the speech and would vanish otherwise.
         faint = 10 ** (-random.uniform(50, 90) / 20) * random.standard_normal(len(times))
-        speech = example.speech * said + faint * float(np.abs(example.speech).max(initial=0))
+        speech = example.speech * gain + faint * float(np.abs(example.speech).max(initial=0))
         return replace(example, motion=motion, speech=speech.astype(np.float32))
-
-
-def _step(values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """From 0 at 0 to 1 at 1, smoothly."""
-    inside = np.clip(values, 0, 1)
-    return cast(npt.NDArray[np.floating], inside * inside * (3 - 2 * inside))
 
 
 # Signal processing.
@@ -592,9 +581,9 @@ def warped(speech: Wave, ratio: float) -> npt.NDArray[np.floating]:
     cepstrum = irfft(logs, SIZE, axis=1)
     cepstrum[:, LIFTER : SIZE - LIFTER + 1] = 0
     envelope = rfft(cepstrum, axis=1).real
-    places = np.minimum(np.arange(SIZE // 2 + 1) / ratio, SIZE // 2 - 1e-6)
-    low = places.astype(int)
-    share = (places - low).astype(np.float32)
+    positions = np.minimum(np.arange(SIZE // 2 + 1) / ratio, SIZE // 2 - 1e-6)
+    low = positions.astype(int)
+    share = (positions - low).astype(np.float32)
     moved = (1 - share) * envelope[:, low] + share * envelope[:, low + 1]
     return signal(spectrum * np.exp(np.clip(moved - envelope, -4, 4)), len(speech))
 

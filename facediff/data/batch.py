@@ -1,4 +1,4 @@
-"""The data contract: one clip, one batch of clips, and what a checkpoint keeps of a corpus.
+"""The data contract: one clip, one batch of clips, and the part of a corpus that a checkpoint keeps.
 
 Audio is 16 kHz mono float32 and spans exactly the time of the motion. Motion is offsets from the speaker's neutral
 template, (frames, points, dims): of vertices in the corpus's unit of length, or of the channels of a parametric space
@@ -73,8 +73,8 @@ class Sample:
 class Batch:
     """Several clips, padded to the longest.
 
-    The fields are those of :class:`Sample` with a batch dimension; a field that only some of the clips have is None.
-    The lengths count each clip's valid samples, frames and steps; ``decoy_audio`` has those of ``audio``. Where several
+    The fields have the names of :class:`Sample` and a batch dimension; a field that only some clips have is None. The
+    lengths count each clip's valid samples, frames and steps; ``decoy_audio`` is as long as ``audio``. Where several
     corpora are trained on together, ``face`` names the one of :attr:`SpeechMotionDataModule.further` that all clips are
     from; it is empty for the data module's own.
     """
@@ -107,7 +107,7 @@ class Batch:
 
     @property
     def window_mask(self) -> Bool[Tensor, "batch frames"]:
-        """True on the valid frames that count: those of training windows, without the frames around them."""
+        """True on the valid frames that count: training windows without the frames around them."""
         if self.window is None:
             return self.mask
         frames = torch.arange(self.motion.shape[1], device=self.motion.device)
@@ -139,7 +139,7 @@ class Batch:
 
     def select(self, clips: Sequence[int]) -> Batch:
         """Some of the clips, in the order given, padded to the longest of them."""
-        chosen = torch.as_tensor(clips, device=self.motion.device)
+        indices = torch.as_tensor(clips, device=self.motion.device)
         lengths = {
             "audio": self.audio_lengths,
             "decoy_audio": self.audio_lengths,
@@ -148,14 +148,14 @@ class Batch:
             "features": self.feature_lengths,
             "partner_frames": self.frame_lengths,
         }
-        picked: dict[str, Any] = {}
+        fields: dict[str, Any] = {}
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
-                own = lengths.get(name)
-                picked[name] = value[chosen] if own is None else value[chosen][:, : int(own[chosen].max())]
+                counts = lengths.get(name)
+                fields[name] = value[indices] if counts is None else value[indices][:, : int(counts[indices].max())]
             elif isinstance(value, list):
-                picked[name] = [value[clip] for clip in clips]
-        return replace(self, **picked)
+                fields[name] = [value[clip] for clip in clips]
+        return replace(self, **fields)
 
     def pin_memory(self) -> Batch:
         """The same batch in page-locked memory; called by PyTorch's loaders."""
@@ -212,13 +212,13 @@ def _pad_partners(samples: Sequence[Sample]) -> Int[Tensor, "batch frames"]:
     return pad_sequence(rows, batch_first=True, padding_value=-1)
 
 
-# What a checkpoint keeps of its corpus, so that it animates a face without the corpus.
+# The part of a corpus that a checkpoint keeps, so that it animates a face without the corpus.
 
 FORMAT_KEY = "facediff_format"
 """Where a checkpoint keeps :data:`FORMAT`."""
 
 FORMAT = 2
-"""Number of the format of checkpoints; those of another number are refused."""
+"""Number of the format of checkpoints; others are refused."""
 
 ASSETS_KEY = "facediff_assets"
 """Where a checkpoint keeps :meth:`Assets.state`."""
@@ -254,7 +254,7 @@ class Rig:
 
     @classmethod
     def of(cls, linear: LinearRig, assets: Assets) -> Rig:
-        """A linear rig as that of all speakers of a corpus; channels that it has no displacements for move nothing.
+        """A linear rig for all speakers of a corpus; channels without displacements in it move nothing.
 
         Its lips and upper face are the vertices that the channels of these regions move at least half as far as any.
         """
@@ -265,15 +265,15 @@ class Rig:
                 f"{linear.title or 'rig'}: has none of the channels of {assets.corpus} ({', '.join(names[:3])} …); "
                 f"give a rig with shapes of these names"
             )
-        nothing = np.zeros(linear.neutral.shape)
-        deltas = torch.from_numpy(
-            np.stack([linear.deltas[rows[name]] if name in rows else nothing for name in names]).astype(np.float32)
-        )
-        moved = {
+        zero = np.zeros(linear.neutral.shape)
+        shapes = np.stack([linear.deltas[rows[name]] if name in rows else zero for name in names])
+        deltas = torch.from_numpy(shapes.astype(np.float32))
+        sizes = {
             region: deltas[[assets.space.face.index(c) for c in channels.tolist() if c in assets.space.face]]
+            .norm(dim=-1)
+            .amax(0)
             for region, channels in assets.regions.items()
         }
-        sizes = {region: own.norm(dim=-1).amax(0) for region, own in moved.items()}
         mesh = replace(
             assets,
             unit=linear.unit or "m",
@@ -301,17 +301,17 @@ class Rig:
 
     def deltas_of(self, identity: str) -> Float[Tensor, "face vertices 3"]:
         """A speaker's shapes; the mean of all others' where they have none of their own."""
-        own = self.deltas.get(identity)
-        # The mean is that of thousands of speakers in some models, so that it is taken where it is needed only.
-        return self.mean if own is None else own
+        # Some models have thousands of speakers, so the mean is taken only where it is needed.
+        shapes = self.deltas.get(identity)
+        return self.mean if shapes is None else shapes
 
     def gram(self, weights: Float[Tensor, "vertices 3"]) -> Float[Tensor, "face face"]:
         """Products D Dᵀ of the weighted deltas D, the mean over speakers, over the number of coordinates.
 
         For weights w of the channels, wᵀ (D Dᵀ) w is the mean squared coordinate of the vertices that they move.
         """
-        grams = [(own := (deltas * weights).flatten(1).double()) @ own.T for deltas in self.deltas.values()]
-        return torch.stack(grams).mean(0) / weights.numel()
+        weighted = ((deltas * weights).flatten(1).double() for deltas in self.deltas.values())
+        return torch.stack([deltas @ deltas.T for deltas in weighted]).mean(0) / weights.numel()
 
 
 @dataclass(frozen=True)
@@ -332,7 +332,7 @@ class Assets:
         references: a default style reference for every identity that has one.
         motion_scale: factor that gives the training motion unit variance; None until it has been measured.
         identity_colours: vertex colours of identities that have their own.
-        space: what the numbers of templates and motion mean.
+        space: meaning of the numbers of templates and motion.
         rig: turns the channels of a parametric space into vertices; None for vertices, or where it is not known.
     """
 
@@ -359,7 +359,7 @@ class Assets:
 
     @property
     def mesh(self) -> Assets:
-        """The corpus as vertices: these assets, or those of the rig."""
+        """The corpus as vertices: these assets, or the rig's."""
         if self.space.is_vertices:
             return self
         if self.rig is None:
@@ -371,19 +371,19 @@ class Assets:
 
     @property
     def scored(self) -> Assets:
-        """What is drawn and scored: vertices, also those that a rig makes of channels; without a rig the channels."""
+        """The assets for pictures and scores: vertices, decoded by a rig where there is one; else the channels."""
         return self if self.rig is None else self.rig.mesh
 
     def to_scored(
         self, motion: Float[Tensor, "*frames points dims"], identity: str
     ) -> Float[Tensor, "*frames scored_points scored_dims"]:
-        """Offsets from the template as those of :attr:`scored`."""
+        """Offsets from the template in the form of :attr:`scored`."""
         return motion if self.rig is None else self.rig.decode(motion, self.space, identity)
 
     def to_vertices(
         self, motion: Float[Tensor, "*frames points dims"], identity: str
     ) -> Float[Tensor, "*frames vertices 3"]:
-        """Offsets from the template as offsets of vertices; those of vertices are themselves."""
+        """Offsets from the template as offsets of vertices; unchanged where they are of vertices already."""
         if self.space.is_vertices:
             return motion
         _ = self.mesh
@@ -398,7 +398,7 @@ class Assets:
         return self.templates[identity]
 
     def colours_of(self, identity: str) -> UInt8[Tensor, "vertices 3"] | None:
-        """The vertex colours of an identity: its own, else those of the mesh file."""
+        """The vertex colours of an identity: its own, else from the mesh file."""
         return self.identity_colours.get(identity, self.colours)
 
     def identity_index(self, identity: str) -> int:
@@ -413,7 +413,7 @@ class Assets:
         """Plain containers and tensors, fit for a checkpoint that is loaded with ``weights_only=True``."""
         state = dict(vars(self))
         state["references"] = {name: (r.clip, r.motion) for name, r in self.references.items()}
-        # Vertices have neither: such checkpoints are those of versions that knew no other space.
+        # Vertices have neither, so that their checkpoints are as in versions without other spaces.
         del state["space"], state["rig"]
         if not self.space.is_vertices:
             state["space"] = self.space.state()
@@ -424,7 +424,7 @@ class Assets:
     def from_state(cls, state: dict[str, Any]) -> Assets:
         """The inverse of :meth:`state`. It comes from a file, so names, shapes and indices are checked."""
         expected = {attribute.name for attribute in fields(cls)}
-        # Checkpoints of 0.2 and older have no colours, and those of vertices no space.
+        # Checkpoints of 0.2 and older have no colours, and checkpoints of vertices no space.
         state = {"identity_colours": {}, "space": VERTICES.state(), "rig": None, **state}
         if state.keys() != expected:
             odd = quoted(sorted(map(str, expected ^ state.keys())))
@@ -444,8 +444,8 @@ class Assets:
 
     def _fault(self) -> str:
         """What contradicts itself and would go unnoticed: names reach files, shapes and indices select vertices."""
-        named = (self.templates, self.regions, self.references, self.identity_colours)
-        names = [self.corpus, self.unit, *self.identities, *(name for entries in named for name in entries)]
+        mappings = (self.templates, self.regions, self.references, self.identity_colours)
+        names = [self.corpus, self.unit, *self.identities, *(name for mapping in mappings for name in mapping)]
         if odd := [name for name in names if not is_name(name)]:
             return f"a name {quoted(odd[0])}; expected a short text without path separators"
         if not self.identities or len(set(self.identities)) < len(self.identities):

@@ -50,7 +50,6 @@ class Biwi(SpeechMotionDataModule):
     circulating: ClassVar[Circulating] = Circulating(
         counts=("test_a", 24, 3879),
         templates={"606284c0": "FaceFormer and TalkingStyle", "d436309f": "FaceDiffuser and DiffSpeaker"},
-        regions={"regions/lve.txt": 4996, "regions/lip.txt": 4996, "BIWI_lip.pkl": 4996, "regions/fdd.txt": 7784},
         unit_area=True,
     )
 

@@ -1,4 +1,4 @@
-"""What scores of conversations read next to a corpus's clips: the partner's motion and who speaks when."""
+"""Files that scores of conversations read next to a corpus's clips: the partner's motion and who speaks when."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from facediff.data.manifest import read_manifest as read_manifest
 from facediff.data.recordings import RecordingFolder
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
 from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage, WeightFile
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
@@ -62,29 +62,15 @@ class Circulating:
 
     Attributes:
         counts: split, clips and frames that published scoring scripts report.
-        templates: projects whose repositories hold a ``templates.pkl``, by the beginning of the file's git blob id.
-        regions: number of distinct vertices in the lists of regions.
+        templates: projects with a ``templates.pkl`` in their repository, by the beginning of the file's git blob id.
         unit_area: whether templates have a surface area of one.
         incomplete: whether some clips were never recorded.
     """
 
     counts: tuple[str, int, int] | None = None
     templates: Mapping[str, str] = field(default_factory=dict)
-    regions: Mapping[str, int] = field(default_factory=dict)
     unit_area: bool = False
     incomplete: bool = False
-
-
-FLAME_REGIONS = {
-    "regions/lve.txt": 428,
-    "regions/fdd.txt": 1501,
-    "FLAME_masks.pkl:lips": 250,
-    "regions/FLAME_masks.pkl:lips": 250,
-    "FLAME_masks.pkl:forehead+eye_region": 827,
-    "regions/FLAME_masks.pkl:forehead+eye_region": 827,
-    "regions/lip.txt": 648,
-}
-"""Vertices of the regions of FLAME's topology that circulate."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +103,8 @@ class Clip:
     @property
     def words(self) -> str:
         """The words of the column ``text`` of ``clips.csv`` if there is one, else the sentence's name."""
-        spoken = re.findall(r"[^\W_]+", self.attributes.get("text", "").casefold())
-        return " ".join(spoken) or self.sentence
+        tokens = re.findall(r"[^\W_]+", self.attributes.get("text", "").casefold())
+        return " ".join(tokens) or self.sentence
 
 
 NameParser = Callable[[str], Clip | None]
@@ -143,7 +129,7 @@ class Corpus:
         parse: finds identity and sentence in a clip's name.
         people: folders of further speakers with the same topology, as ``facediff data import-person`` writes them.
         storage: where motion and speech of the clips lie; the folder itself if None.
-        space: what the motion's numbers mean; ``n_vertices`` counts its channels where it is not that of vertices.
+        space: meaning of the motion's numbers; ``n_vertices`` counts its channels where they are no vertices.
     """
 
     def __init__(
@@ -166,21 +152,19 @@ class Corpus:
         self.parse = parse
         self.people = list(people)
         self.store = ArrayStore(cache_dir() / "speech")
-        for folder in people:
-            if (folder / "vertices_npy").is_dir() != space.is_vertices:
-                held, needed = ("channels", "vertices") if space.is_vertices else ("vertices", "channels")
-                command = "import-person" if space.is_vertices else "import-take"
-                raise FaceDiffError(
-                    f"{folder}: holds a speaker's motion in {held}; expected {needed}, as the corpus in {root} has. "
-                    f"Give a folder that `facediff data {command}` wrote, or a checkpoint of a model of {held}"
-                )
-        # An imported speaker in channels is a recording as it came, in whatever order its file has.
+        if odd := [folder for folder in people if (folder / "vertices_npy").is_dir() != space.is_vertices]:
+            expected = "vertices (import-person)" if space.is_vertices else "channels (import-take)"
+            raise FaceDiffError(
+                f"{odd[0]}: expected a speaker's motion in {expected}, as the corpus in {root} has; give another folder"
+            )
+        # An imported speaker in channels is a recording as it came, with its own order of channels.
         self._storages: dict[Path, ClipStorage] = {
             folder: ClipFolder(folder, n_vertices) if space.is_vertices else RecordingFolder(folder, space, frame_rate)
             for folder in people
         }
-        own = ClipFolder(root, n_vertices) if space.is_vertices else ChannelFolder(root, space)
-        self._storages[root] = storage or own
+        self._storages[root] = storage or (
+            ClipFolder(root, n_vertices) if space.is_vertices else ChannelFolder(root, space)
+        )
         stored = stored_frame_rate or frame_rate
         self._strides = {folder: self._stride(folder, stored) for folder in (root, *people)}
         self._frames: dict[str, int] = {}
@@ -207,12 +191,7 @@ class Corpus:
         if not clips:
             raise FaceDiffError(f"{self.root}: no clip found; expected wav/<clip>.wav with vertices_npy/<clip>.npy")
         for person in self.people:
-            more = self._clips_of(person, parse_name)
-            for name in more.keys() & clips.keys():
-                raise FaceDiffError(
-                    f"{person}: its clip {name} is also in {clips[name].root}; import the speaker under a new name"
-                )
-            clips |= more
+            clips |= self._clips_of(person, parse_name)
         return clips
 
     def _clips_of(self, root: Path, parse: NameParser) -> dict[str, Clip]:
@@ -232,11 +211,10 @@ class Corpus:
             return {clip.identity: torch.zeros(self.n_vertices, 1) for clip in self.clips.values()}
         templates = read_templates(self.root / "templates.pkl", self.n_vertices)
         for root in self.people:
-            name = str(read_manifest(root).get("person"))
-            own = read_templates(root / "templates.pkl", self.n_vertices)
-            if name in templates:
+            faces = read_templates(root / "templates.pkl", self.n_vertices)
+            if name := next(iter(faces.keys() & templates.keys()), None):
                 raise FaceDiffError(f"{root}: {self.root} has a {name} already; import the speaker under a new name")
-            templates |= {name: own[name]} if name in own else {}
+            templates |= faces
         return templates
 
     def template(self, clip: Clip) -> Tensor:
@@ -275,24 +253,26 @@ class Corpus:
         mean = opened.checked(self._all_frames(clip)).mean(0, dtype=np.float64)
         return torch.from_numpy(opened.decode(mean[None].astype(np.float32))[0] - self.template(clip).numpy()).double()
 
-    def read_projected(self, clip: Clip, project: Callable[[Tensor], Tensor], kept: dict[str, Tensor]) -> Tensor:
+    def read_projected(
+        self, clip: Clip, project: Callable[[Tensor], Tensor], shapes_by_speaker: dict[str, Tensor]
+    ) -> Tensor:
         """An affine function of each frame of a clip, (T, K).
 
         Args:
             clip: the clip.
             project: takes offsets from the template (T, V, dims) to (T, K).
-            kept: what the function makes of speakers' shapes, by speaker; filled here.
+            shapes_by_speaker: values of the function for the shapes of speakers; filled here.
         """
         opened = self._open(clip)
         if not isinstance(opened, WeightFile):
             return project(self.read_motion(clip))
         # Decoding is linear too: weights meet the function of 54 shapes, instead of the function meeting each frame.
-        if clip.identity not in kept:
+        if clip.identity not in shapes_by_speaker:
             shapes = torch.from_numpy(np.array(opened.rig, np.float32))
             shapes[0] -= self.template(clip)
             images = project(torch.cat([torch.zeros_like(shapes[:1]), shapes]))
-            kept[clip.identity] = torch.cat([images[1:2], images[2:] - images[:1]])
-        images = kept[clip.identity]
+            shapes_by_speaker[clip.identity] = torch.cat([images[1:2], images[2:] - images[:1]])
+        images = shapes_by_speaker[clip.identity]
         return torch.from_numpy(opened.checked(self._all_frames(clip))) @ images[1:] + images[0]
 
     @property
@@ -319,10 +299,10 @@ class Corpus:
         opened, stride = self._open(clip), self._strides[clip.root]
         frames = self._frames[clip.name]
         count = min(frames, count)
-        places = torch.linspace(0, frames - 1, count)
+        numbers = torch.linspace(0, frames - 1, count)
         if phase is not None:
-            places = (torch.arange(count) + phase) * (frames / count)
-        picks = [number * stride for number in places.long().tolist()]
+            numbers = (torch.arange(count) + phase) * (frames / count)
+        picks = [number * stride for number in numbers.long().tolist()]
         return torch.from_numpy(opened.offsets(picks, self.template(clip).numpy()))
 
     def read_audio(self, clip: Clip, start: int, stop: int) -> Tensor:
@@ -337,19 +317,18 @@ class Corpus:
         It is made of each folder's ``manifest.json``, which holds the checksums of a prepared corpus, and, since not
         every folder has one, of the sizes and times of its files.
         """
-        facts: list[object] = [clip.name for clip in clips]
+        parts: list[object] = [clip.name for clip in clips]
         for root in sorted({clip.root for clip in clips}):
-            own = self._storages[root]
             manifest = root / "manifest.json"
-            facts += [sha256(manifest) if manifest.is_file() else "", self._strides[root]]
-            facts += [sha256(root / "templates.pkl") if self.space.is_vertices else self.space]
-            facts += [own.version(clip.name) for clip in clips if clip.root == root]
-        return hashlib.sha256("\0".join(map(str, facts)).encode()).hexdigest()
+            parts += [sha256(manifest) if manifest.is_file() else "", self._strides[root]]
+            parts += [sha256(root / "templates.pkl") if self.space.is_vertices else self.space]
+            parts += [self._storages[root].version(clip.name) for clip in clips if clip.root == root]
+        return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
 
     def read_mesh(self, files: Sequence[str]) -> Mesh | None:
         """The first mesh file that exists, in the folder itself or in ``templates/``; None if there is none."""
-        places = [folder / file for file in files for folder in (self.root, self.root / "templates")]
-        path = next((place for place in places if place.is_file()), None)
+        paths = [folder / file for file in files for folder in (self.root, self.root / "templates")]
+        path = next(filter(Path.is_file, paths), None)
         if path is None:
             return None
         mesh = read_mesh(path)
@@ -361,10 +340,6 @@ class Corpus:
         """Colours (V, 3) from 0 to 255 of speakers who have their own, from ``colours.npz``; empty without the file."""
         path = self.root / "colours.npz"
         arrays = read_arrays(path) if path.is_file() else {}
-        for name, array in arrays.items():
-            if array.shape != (self.n_vertices, 3) or array.dtype != np.uint8:
-                kind = f"{array.dtype} {array.shape}"
-                raise FaceDiffError(f"{path}: colours of {name} are {kind}; expected uint8 ({self.n_vertices}, 3)")
         return {name: torch.from_numpy(array) for name, array in arrays.items() if name in self.templates}
 
     def read_pairs(self, file: str) -> Tensor | None:
@@ -375,12 +350,11 @@ class Corpus:
         remedy = "expected one pair of vertex indices a line, such as 12, 34"
         rows: list[tuple[int, int]] = []
         for number, row in enumerate(read_table(path, remedy=remedy), 1):
-            words = " ".join(row).split()
-            if len(words) != 2 or not all(word.isdecimal() and int(word) < self.n_vertices for word in words):
+            pair = " ".join(row).split()
+            if len(pair) != 2 or not all(word.isdecimal() and int(word) < self.n_vertices for word in pair):
                 raise FaceDiffError(f"{path}: row {number} is {','.join(row)!r}; {remedy}, below {self.n_vertices}")
-            rows.append((int(words[0]), int(words[1])))
-        pairs = torch.tensor(rows, dtype=torch.long).view(-1, 2)
-        return pairs
+            rows.append((int(pair[0]), int(pair[1])))
+        return torch.tensor(rows, dtype=torch.long).view(-1, 2)
 
 
 # The readers, one for each kind of file; motion and speech are read by facediff.data.storage.
@@ -391,7 +365,7 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
 
     Args:
         path: the file.
-        n_vertices: vertices of the mesh; those of the first face if None.
+        n_vertices: vertices of the mesh; as many as the first face has if None.
     """
     loaded = load_template_dict(path)
     if n_vertices is None:
@@ -400,11 +374,10 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
 
 
 def load_template_dict(path: Path) -> dict[Any, Any]:
-    """The dict in ``templates.pkl``, whose entries are still to be checked by :func:`as_template`."""
-    loaded = load_pickle(path) if path.is_file() else None
+    """The dict in ``templates.pkl``; :func:`as_template` checks its entries."""
+    loaded = load_pickle(path)
     if not isinstance(loaded, dict) or not loaded:
-        missing = "no such file" if loaded is None else f"got {type(loaded).__name__}"
-        raise FaceDiffError(f"{path}: {missing}; expected a dict from identity to (V, 3) array")
+        raise FaceDiffError(f"{path}: holds {quoted(loaded)}; expected a dict from identity to (V, 3) array")
     return loaded
 
 
@@ -418,11 +391,11 @@ def as_template(
         entry = np.array(None)
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
         array = np.array(entry, dtype) if entry.dtype.kind == "f" else np.empty(0, dtype)
-    bad = np.count_nonzero(~(np.abs(array) <= COORDINATE))
-    named = isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST
-    if not named or array.shape not in ((3 * n_vertices,), (n_vertices, 3)) or bad:
+    beyond = np.count_nonzero(~(np.abs(array) <= COORDINATE))
+    has_name = isinstance(name, str) and name.isprintable() and 0 < len(name) <= LONGEST
+    if not has_name or array.shape not in ((3 * n_vertices,), (n_vertices, 3)) or beyond:
         raise FaceDiffError(
-            f"{path}: the template of {quoted(name)} is {entry.dtype} {entry.shape} with {bad} coordinates that are "
+            f"{path}: the template of {quoted(name)} is {entry.dtype} {entry.shape} with {beyond} coordinates that are "
             f"NaN or beyond {COORDINATE:g}; expected finite floating-point numbers, ({n_vertices}, 3)"
         )
     return array.reshape(n_vertices, 3)
@@ -436,23 +409,21 @@ def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
     remedy = "save it as CSV UTF-8, with one row a clip"
     rows = list(read_table(path, remedy=remedy))
     header = rows.pop(0) if rows else []
-    if rows and "clip" not in header:
-        raise FaceDiffError(f"{path}: has no column clip; expected clip and further columns, one row a clip")
     table: dict[str, dict[str, str]] = {}
     for number, cells in enumerate(rows, 2):
         row = {key: cell.strip() for key, cell in zip(header, cells, strict=False) if key}
         fits = len(cells) >= len(header) and not any(cells[len(header) :]) and len(row) == len([*filter(None, header)])
-        if not fits or not all(map(str.isprintable, row.values())) or row["clip"] in table:
+        if not fits or not all(map(str.isprintable, row.values())) or row.get("clip") in (None, *table):
             raise FaceDiffError(
-                f"{path}: row {number} is {quoted(cells)}; expected {len(header)} printable cells and another clip; "
-                f"{remedy}"
+                f"{path}: row {number} is {quoted(cells)}; expected {len(header)} printable cells with the column "
+                f"clip, which names another clip in each row; {remedy}"
             )
         table[row.pop("clip")] = row
     return table
 
 
 def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, help_text: str = "") -> Region:
-    """The region of the first source whose file exists.
+    """The region of the first source with a file.
 
     A source is a file below ``root``: a text file of indices separated by "," or ", "; a pickle with a list of indices;
     or ``FLAME_masks.pkl:lips``, one or several (joined by "+") masks of a pickle with named masks. ``all`` is every
@@ -465,15 +436,12 @@ def find_region(root: Path, sources: Sequence[str], name: str, n_vertices: int, 
         path = root / file
         if not path.is_file():
             continue
-        try:
+        with damaged(path, "get the file again"):
             if path.suffix == ".pkl":
                 return Region.from_indices(name, read_masks(path, masks), n_vertices=n_vertices)
             return Region.from_file(path, name=name, n_vertices=n_vertices)
-        except ValueError as error:
-            message = str(error)
-            raise FaceDiffError(message if str(path) in message else f"{path}: {message}") from error
-    looked = ", ".join(str(root / source) for source in sources)
+    paths = ", ".join(str(root / source) for source in sources)
     raise FaceDiffError(
-        f"{root}: no file lists the vertices of the {name.replace('_', ' ')}; looked for {looked}. {help_text} "
+        f"{root}: no file lists the vertices of the {name.replace('_', ' ')}; looked for {paths}. {help_text} "
         f"To train and score on all vertices instead, set data.{name}={ALL}"
     )

@@ -1,4 +1,4 @@
-"""The base of all corpora's data modules: options, splits, style references, loaders, and what a checkpoint keeps.
+"""The base of all corpora's data modules: options, splits, style references, loaders, and a checkpoint's part of it.
 
 A corpus adds its facts (class attributes) and decides which clip belongs to which split.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -47,12 +47,12 @@ from facediff.data.measuring import measure_components, measure_scale, measure_w
 from facediff.data.mixing import mixed_loader
 from facediff.data.packed.stores import address_of, is_packed
 from facediff.data.storage import ChannelFolder, ClipStorage
-from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.errors import ArgumentError, FaceDiffError, choices, damaged
 from facediff.hyperparameters import keeps_arguments, plain, read_options
 from facediff.registry import corpus as corpora
 from facediff.registry import find_class
 from facediff.spaces import VERTICES, Space
-from facediff.utils.hints import defaults, is_name
+from facediff.utils.hints import defaults, is_name, options_of
 from facediff.utils.licences import Commercial, Licence, merged, read_licences
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors
@@ -75,21 +75,21 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         def __init__(self, *, seed: int = 0, **options: Any) -> None:
             super().__init__(**options)
 
-    All options, its own and those of this class, are kept as hyper-parameters.
+    All options, also of this class, are kept as hyper-parameters.
 
     Class attributes:
-        corpus_name: what the corpus is called, in tables and checkpoints.
+        corpus_name: name of the corpus in tables and checkpoints.
         synthetic: whether it is synthetic.
         unit: unit of length; ``unit`` in a prepared folder's ``manifest.json`` overrides it.
         frame_rate: motion frames per second that the models see.
         stored_frame_rate: motion frames per second of circulating copies, where that differs.
         n_vertices: vertices of its topology, or channels of its space.
-        space: what the numbers of its motion mean.
+        space: meaning of the numbers of its motion.
         identities: speakers of the training split, in the order of the identity index.
         mesh_files: files with the faces, in order of preference.
         region_sources: files that list the vertices of the regions, in order of preference.
         region_help: where to get such files.
-        reference_attributes: what a style reference shares with its target where possible.
+        reference_attributes: attributes that a style reference shares with its target where possible.
         score_attributes: columns of the table of test scores of single clips; ``reference_attributes`` unless stated.
         compared_speakers: speakers among whom the generation metrics look for the nearest speaker and for references
             of another speaker; all with a template if None.
@@ -125,11 +125,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         augmentations: changes of training speech by name with their options, such as ``[voice:semitones=4, room,
             noise]``, in this order; see docs/voices.md.
         augmented_share: share of the training clips to which they are applied; the others stay as recorded.
-        augmented_clips: only those whose attribute fits a pattern are ever changed, such as ``{voice: "flite:*"}``;
+        augmented_clips: only clips with an attribute that fits a pattern are changed, such as ``{voice: "flite:*"}``;
             attributes are the further columns of ``clips.csv``.
         people: folders of further speakers to train on, as ``facediff data import-person`` writes them; they come first
             in the order of the identity index.
-        extra_identities: further identities of the corpus to train on, with those of their clips that belong to no
+        extra_identities: further identities of the corpus to train on, with their clips that belong to no
             split; they come next in the order of the identity index.
         train_identities: train on the clips of these identities only; of all if None.
         lips: file that lists the vertices of the lips, e.g. ``regions/lve.txt`` or ``FLAME_masks.pkl:lips``, or
@@ -195,12 +195,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         further_corpora: dict[str, dict[str, Any]] | None = None,
     ) -> None:
         super().__init__()
-        facts = ("corpus_name", "unit", "frame_rate", "n_vertices", "identities")
-        missing = [name for name in facts if not hasattr(self, name)]
-        if missing:
-            raise FaceDiffError(f"{type(self).__name__}: the class states no {' and no '.join(missing)}")
-        if not str(root):
-            raise ArgumentError({"root": root}, "expected the corpus's folder")
+        names = ("corpus_name", "unit", "frame_rate", "n_vertices", "identities")
+        if undefined := [name for name in names if not hasattr(self, name)]:
+            raise FaceDiffError(f"{type(self).__name__}: the class states no {' and no '.join(undefined)}")
         self.source = address_of(root) or str(root)
         self.batch_size = batch_size
         self.max_frames_per_batch = max_frames_per_batch
@@ -219,24 +216,18 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             )
         self.augmented_clips = augmented_clips or {}
         self.people = [Path(folder).expanduser() for folder in people or []]
-        self.regions = {
-            name: self.region_sources[name] if chosen is None else (chosen,)
-            for name, chosen in (("lips", lips), ("upper_face", upper_face))
-        }
+        files = {"lips": lips, "upper_face": upper_face, "face": face}
+        self.regions = {**self.region_sources, **{name: (file,) for name, file in files.items() if file is not None}}
         self.eyelid_file = eyelid_pairs
-        if face is not None:
-            self.regions["face"] = (face,)
         self.extra_identities = list(extra_identities or [])
         self.train_identities = None if train_identities is None else list(train_identities)
         self.identities = [*map(person_name, self.people), *self.extra_identities, *type(self).identities]
-        for name in self.identities:
-            if self.identities.count(name) > 1:
-                raise FaceDiffError(
-                    f"data.people: {name} is there more than once among the corpus's identities, the imported speakers "
-                    f"and data.extra_identities; import the speaker under a new name, or omit one"
-                )
-        unknown = [name for name in self.train_identities or [] if name not in self.identities]
-        if unknown:
+        if duplicates := [name for name in self.identities if self.identities.count(name) > 1]:
+            raise FaceDiffError(
+                f"data.people: {duplicates[0]} occurs more than once among the corpus's identities, imported speakers "
+                f"and data.extra_identities; import the speaker under a new name, or omit one"
+            )
+        if unknown := [name for name in self.train_identities or [] if name not in self.identities]:
             raise ArgumentError(
                 {"train_identities": unknown[0]}, f"no such identity: {choices(unknown[0], self.identities)}"
             )
@@ -271,13 +262,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         **options: Any,  # noqa: ANN401
     ) -> Self:
         """Lightning's method, after the checks that every checkpoint goes through; the arguments are Lightning's."""
-        content = load_tensors(checkpoint_path)
-        hyperparameters = content.get("datamodule_hyper_parameters") if isinstance(content, dict) else None
-        if not isinstance(hyperparameters, dict):
-            raise FaceDiffError(
-                f"{checkpoint_path}: holds no options of a data module; expected a file of `facediff fit`"
-            )
-        read_options(str(checkpoint_path), cls, hyperparameters, {})
+        with damaged(checkpoint_path, "expected a file of `facediff fit`"):
+            hyperparameters = load_tensors(checkpoint_path)["datamodule_hyper_parameters"]
+            read_options(str(checkpoint_path), cls, hyperparameters, {})
         if not isinstance(checkpoint_path, str | Path):
             checkpoint_path.seek(0)
         data: Self = super().load_from_checkpoint(checkpoint_path, *arguments, **{**options, "weights_only": True})
@@ -290,8 +277,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def licences(self) -> tuple[Licence, ...]:
         """The labels of everything that is trained on: the corpus, and every imported speaker."""
-        further = [data.licences() for data in self.further.values()]
-        return merged([self.corpus_licence()], map(person_licence, self.people), *further)
+        labels = (data.licences() for data in self.further.values())
+        return merged([self.corpus_licence()], map(person_licence, self.people), *labels)
 
     # Methods that a corpus overrides.
 
@@ -330,8 +317,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
         It is in the speakers' own language, English, or in another by espeak-ng's name, such as de.
 
-        None if they cannot say what they are told, as people cannot. An audio encoder learns from it what it should
-        hear in a person's recording of the same words (:mod:`facediff.models.transcribed`).
+        None if they cannot speak on demand, as people cannot. With it an audio encoder is trained on people's
+        recordings of the same words (:mod:`facediff.models.transcribed`).
         """
         return None
 
@@ -348,9 +335,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
         A corpus that makes its folder does so before it calls this.
         """
-        missing = {split: len(names) for split, names in self.missing_clips().items() if names}
-        if missing:
-            counts = ", ".join(f"{count} of {split}" for split, count in missing.items())
+        counts = ", ".join(f"{len(names)} of {split}" for split, names in self.missing_clips().items() if names)
+        if counts:
             print(f"{self.corpus_name}: missing clips, which are left out: {counts}", flush=True)
         for data in self.further.values():
             data.prepare_data()
@@ -373,7 +359,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     @classmethod
     def missing(cls, root: Path) -> FaceDiffError:
-        """What is wrong where the corpus is not in its folder, and how to obtain it."""
+        """The error for a corpus that is not in its folder, with the way to obtain it."""
         advice = "set data.root to your copy (--data.root, or --data-root where a command has that)"
         return FaceDiffError(f"{no_such_folder(root)}; {advice}. {cls.obtain}".rstrip())
 
@@ -394,10 +380,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """The corpus on disk."""
         if not self.root.is_dir():
             raise self.missing(self.root)
-        if not self.space.is_vertices and self.packed is not None:
-            raise FaceDiffError(
-                "data.root: packed corpora hold vertices, and this data module reads channels; give the corpus's folder"
-            )
         return Corpus(
             self.root,
             self.n_vertices,
@@ -424,8 +406,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         # A speaker who was imported in channels has no face of their own: the mean one is shown.
         mean = torch.stack([*mesh.templates.values()]).mean(0)
         templates = {**dict.fromkeys(map(person_name, self.people), mean), **mesh.templates}
-        bare = replace(assets, templates=templates, references={}, space=VERTICES)
-        return Rig(self._with_mesh(bare, mesh), self.deltas())
+        neutral = replace(assets, templates=templates, references={}, space=VERTICES)
+        return Rig(self._with_mesh(neutral, mesh), self.deltas())
 
     @property
     def mesh_corpus(self) -> Corpus | None:
@@ -433,7 +415,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return self.corpus if self.space.is_vertices else None
 
     def deltas(self) -> dict[str, Tensor]:
-        """What the channels of :attr:`Space.face` move the vertices by at 1, (K, V, 3) by speaker; of channels only."""
+        """Displacements of the vertices by the face's channels at 1, (K, V, 3) by speaker; of channels only."""
         return {}
 
     @property
@@ -455,12 +437,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         are trained on where they belong to ``extra_identities``.
         """
         if clip.root in self.people:
-            listed = clip.attributes.get("split")
-            if listed not in ("train", "val", "test"):
-                raise FaceDiffError(
-                    f"{clip.root / 'clips.csv'}: split of {clip.name} is {listed!r}, expected train, val or test"
-                )
-            return "test_a" if listed == "test" else listed
+            return split_in_table(clip)
         split = self.split_of(clip)
         return "train" if split is None and clip.identity in self.extra_identities else split
 
@@ -475,20 +452,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
         A speaker with clips in evaluated splits only is given another of these clips, never the target itself.
         """
-        evaluated: dict[str, list[Clip]] = {}
-        for clip in self.corpus.clips.values():
-            evaluated.setdefault(clip.identity, []).append(clip)
-        return ReferencePolicy(
-            {**evaluated, **self.known_clips()}, self.reference_attributes, self.reference, self.reference_frames
-        )
+        candidates = {**by_speaker(self.corpus.clips.values()), **self.known_clips()}
+        return ReferencePolicy(candidates, self.reference_attributes, self.reference, self.reference_frames)
 
     def known_clips(self) -> dict[str, list[Clip]]:
         """Each speaker's clips outside the evaluated splits, by speaker; speakers who have none are left out."""
-        by_speaker: dict[str, list[Clip]] = {}
-        for clip in self.corpus.clips.values():
-            if self.find_split(clip) in ("train", None):
-                by_speaker.setdefault(clip.identity, []).append(clip)
-        return by_speaker
+        return by_speaker(clip for clip in self.corpus.clips.values() if self.find_split(clip) in ("train", None))
 
     def dataset(self, split: str, *, training: bool = False) -> MotionDataset:
         """Samples of a split: whole clips with fixed references, or in training random windows and references."""
@@ -537,17 +506,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def _mouth(self) -> npt.NDArray[np.float32]:
         """Mask of the vertices that speech moves (V,): 1 for all but the upper face."""
-        if self.features.reader is not None:
-            raise FaceDiffError(
-                "data.augmentations: speech features are cached before training, from speech that is not augmented; "
-                "omit the callback that caches them, or the augmentations"
-            )
-        moving = [change for change in (self.augmenter.augmentations if self.augmenter else []) if change.moves]
-        if moving and (self.window is not None or self.pair_sentences):
-            raise FaceDiffError(
-                "data.augmentations: speed changes the number of frames, which windows and pairs of clips rely on; "
-                "omit it, or train on whole clips"
-            )
+        fault = "cached speech features are not augmented" if self.features.reader is not None else ""
+        moves = any(change.moves for change in (self.augmenter.augmentations if self.augmenter else []))
+        if moves and (self.window is not None or self.pair_sentences):
+            fault = "speed changes the number of frames, which windows and pairs of clips rely on"
+        if fault:
+            raise FaceDiffError(f"data.augmentations: {fault}; omit the augmentations, or the cache, windows and pairs")
         mouth = np.ones(self.n_vertices, np.float32)
         if self.space.is_vertices:
             sources = self.regions["upper_face"]
@@ -586,7 +550,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return self._assets
 
     def _with_mesh(self, assets: Assets, corpus: Corpus) -> Assets:
-        """The same with what a corpus of vertices has: triangles, colours, regions, inner lips."""
+        """The same with the triangles, colours, regions and inner lips of a corpus of vertices."""
         mesh = corpus.read_mesh(self.mesh_files)
         return replace(
             assets,
@@ -644,7 +608,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     @property
     def faces(self) -> dict[str, dict[str, Any]]:
-        """What a model's sizes follow from, for every corpus of :attr:`further`, as plain data."""
+        """The numbers that determine a model's sizes, for every corpus of :attr:`further`, as plain data."""
         return {
             name: {
                 "n_vertices": data.n_vertices,
@@ -668,10 +632,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def _mixed(self, split: str, *, training: bool = False) -> ResumableLoader:
         """A loader of this corpus, or of this and all further ones."""
-        own = self._loader(split, training=training)
+        loaders = {"": self._loader(split, training=training)}
         if not self.further:
-            return own
-        loaders = {"": own}
+            return loaders[""]
         for name, data in self.further.items():
             data.trainer = self.trainer
             loaders[name] = data._loader(split, training=training)
@@ -730,8 +693,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         batches = trainer.fit_loop.epoch_loop.batch_progress.current
         if epochs.started <= epochs.processed:  # between two epochs
             return epochs.processed, 0
-        done = batches.completed >= trainer.num_training_batches
-        return (epochs.processed + 1, 0) if done else (epochs.processed, batches.completed)
+        at_end = batches.completed >= trainer.num_training_batches
+        return (epochs.processed + 1, 0) if at_end else (epochs.processed, batches.completed)
 
     def _loader_options(self) -> dict[str, Any]:
         return {
@@ -745,21 +708,39 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
 def further_corpus(name: str, options: dict[str, Any]) -> SpeechMotionDataModule:
     """The data module of another face, from its options."""
-    option = f"further_corpora.{name}"
-    named = options.get("corpus")
+    corpus = options.get("corpus")
     # A checkpoint states these options too: as anywhere in it, a class must be registered, or imported already.
-    path = f"facediff.registry.corpus.{named}" if named in corpora.names() else named
+    path = f"facediff.registry.corpus.{corpus}" if corpus in corpora.names() else corpus
     module = find_class(corpora, path, SpeechMotionDataModule)
-    if not is_name(name) or module is None or "further_corpora" in options:
+    arguments = {key: value for key, value in options.items() if key != "corpus"}
+    unknown = arguments.keys() - (options_of(module) if module is not None else {})
+    if not is_name(name) or module is None or "further_corpora" in options or unknown:
         raise ArgumentError(
-            {option: options},
-            f"expected the options of a data module with corpus=NAME, one of {', '.join(corpora.names())}",
+            {f"further_corpora.{name}": options},
+            f"expected options of a data module with corpus=NAME, one of {', '.join(corpora.names())}",
         )
-    try:
-        data: SpeechMotionDataModule = module(**{key: value for key, value in options.items() if key != "corpus"})
-    except TypeError as error:  # an option that the corpus does not have
-        raise ArgumentError({option: options}, f"{named} refuses its options ({error})") from error
+    data: SpeechMotionDataModule = module(**arguments)
     return data
+
+
+def by_speaker(clips: Iterable[Clip]) -> dict[str, list[Clip]]:
+    """Clips by the name of their speaker."""
+    speakers: dict[str, list[Clip]] = {}
+    for clip in clips:
+        speakers.setdefault(clip.identity, []).append(clip)
+    return speakers
+
+
+def split_in_table(clip: Clip) -> str | None:
+    """The split that ``clips.csv`` states for a clip; ``test`` is test A, ``none`` and ``references`` are no split."""
+    splits: dict[str | None, str | None] = {"test": "test_a", "none": None, "references": None}
+    splits |= {split: split for split in get_args(Split)}
+    split = clip.attributes.get("split")
+    if split not in splits:
+        raise FaceDiffError(
+            f"{clip.root / 'clips.csv'}: split of {clip.name} is {split!r}; expected train, val, test or none"
+        )
+    return splits[split]
 
 
 def channel_regions(space: Space) -> dict[str, Tensor]:
@@ -777,20 +758,16 @@ def no_such_folder(folder: Path) -> str:
 
 def person_name(folder: Path) -> str:
     """The speaker of a folder, as ``facediff data import-person`` wrote it."""
-    if not folder.is_dir():
-        raise FaceDiffError(f"data.people: {no_such_folder(folder)}; expected one of `facediff data import-person`")
     name = read_manifest(folder).get("person")
     if not isinstance(name, str):
-        raise FaceDiffError(
-            f"data.people: {folder} is no speaker's folder (its manifest.json names none); make one with "
-            f"`facediff data import-person`"
-        )
+        fault = f"{folder}: no manifest.json there names a speaker" if folder.is_dir() else no_such_folder(folder)
+        raise FaceDiffError(f"data.people: {fault}; expected a folder of `facediff data import-person`")
     return name
 
 
 def person_licence(folder: Path) -> Licence:
     """The terms of an imported speaker's recordings, as ``manifest.json`` of their folder states them."""
     manifest = read_manifest(folder)
-    stated = manifest.get("licence")
-    (label,) = read_licences(folder / "manifest.json", [Licence("speaker").state() if stated is None else stated])
+    terms = manifest.get("licence") or Licence("speaker").state()
+    (label,) = read_licences(folder / "manifest.json", [terms])
     return replace(label, of=f"speaker {manifest.get('person')}")

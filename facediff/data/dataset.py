@@ -40,27 +40,27 @@ class FeatureSlot:
 
 
 class ProjectionSlot:
-    """What a data set makes of training motion, chosen by the model when the loaders have been made already."""
+    """A projection of training motion, chosen by the model when the loaders have been made already."""
 
     def __init__(self) -> None:
         self.project: Callable[[Tensor], Tensor] | None = None
-        self._kept: dict[str, Tensor] = {}
+        self._components: dict[str, Tensor] = {}
         self._shapes: dict[str, Tensor] = {}
 
     def choose(self, project: Callable[[Tensor], Tensor] | None) -> None:
         """Make components (T, K) of a clip's offsets (T, V, 3) from now on; None leaves them as they are."""
         self.project = project
-        self._kept.clear()
+        self._components.clear()
         self._shapes.clear()
 
     def read(self, corpus: Corpus, clip: Clip, start: int, stop: int) -> Tensor:
         """Some frames of a clip in the chosen form."""
         if self.project is None:
             return corpus.read_motion(clip, start, stop)
-        if clip.name not in self._kept:
+        if clip.name not in self._components:
             # By whole clips, so that a frame's components do not depend on the window in which it was read first.
-            self._kept[clip.name] = corpus.read_projected(clip, self.project, self._shapes)
-        return self._kept[clip.name][start:stop]
+            self._components[clip.name] = corpus.read_projected(clip, self.project, self._shapes)
+        return self._components[clip.name][start:stop]
 
 
 class CachedFeatures:
@@ -184,18 +184,17 @@ class ClipBatches(ResumableBatches[list[Pick]]):
         """This process's batches of the current epoch."""
         # Every process computes the batches of all and takes its share: the seed alone keeps them in agreement.
         batches = self._all(torch.Generator().manual_seed(self._hash("order")))
-        places = range(self.rank + self.done * self.num_replicas, len(batches), self.num_replicas)
-        for place in places:
-            # Clips are repeated only where every batch is a single clip, so places past the last clip repeat one.
-            repeated = not self.training and place >= len(self.lengths)
-            yield [Pick(*self._pick(unit), repeated) for unit in batches[place]]
+        for number in range(self.rank + self.done * self.num_replicas, len(batches), self.num_replicas):
+            # Clips are repeated only where every batch is a single clip, so numbers past the last clip repeat one.
+            repeated = not self.training and number >= len(self.lengths)
+            yield [Pick(*self._pick(unit), repeated) for unit in batches[number]]
 
-    def _hash(self, what: object) -> int:
-        return zlib.crc32(f"{self.seed}:{self.epoch}:{what}".encode())
+    def _hash(self, subject: object) -> int:
+        return zlib.crc32(f"{self.seed}:{self.epoch}:{subject}".encode())
 
-    def _pick(self, place: int) -> tuple[int, int]:
-        """The clip at a place, and the seed of its random choices; place i + n · clips is the n-th copy of clip i."""
-        copy, index = divmod(place, len(self.lengths))
+    def _pick(self, number: int) -> tuple[int, int]:
+        """A clip and the seed of its random choices; number i + n · clips is the n-th copy of clip i."""
+        copy, index = divmod(number, len(self.lengths))
         return index, self._hash(f"{index}:{copy}" if copy else index) if self.training else 0
 
     def _units(self, generator: torch.Generator) -> list[list[int]]:
@@ -205,11 +204,10 @@ class ClipBatches(ResumableBatches[list[Pick]]):
             return [[index] for index in range(count)]
         units: list[list[int]] = []
         for copy in range(max(self.copies, default=1)):
-            there = [
-                index for index in torch.randperm(count, generator=generator).tolist() if self.copies[index] > copy
-            ]
-            chosen = [[index] for index in there] if self.groups is None else paired(there, self.groups, generator)
-            units += [[copy * count + index for index in unit] for unit in chosen]
+            order = torch.randperm(count, generator=generator).tolist()
+            clips = [index for index in order if self.copies[index] > copy]
+            members = [[index] for index in clips] if self.groups is None else paired(clips, self.groups, generator)
+            units += [[copy * count + index for index in unit] for unit in members]
         if max(self.copies, default=1) > 1:
             units = [units[i] for i in torch.randperm(len(units), generator=generator).tolist()]
         return units
@@ -225,11 +223,11 @@ class ClipBatches(ResumableBatches[list[Pick]]):
         count = len(self.lengths)
         rounded = [-(-max(self.lengths[i % count] for i in unit) // width) * width for unit in units]
         batches: list[list[int]] = []
-        for place in sorted(range(len(units)), key=lambda k: rounded[k]):  # stable: random within a bucket
-            if batches and rounded[place] * (len(batches[-1]) + len(units[place])) <= self.max_frames:
-                batches[-1] += units[place]
+        for number in sorted(range(len(units)), key=lambda k: rounded[k]):  # stable: random within a bucket
+            if batches and rounded[number] * (len(batches[-1]) + len(units[number])) <= self.max_frames:
+                batches[-1] += units[number]
             else:
-                batches.append(list(units[place]))
+                batches.append(list(units[number]))
         return batches
 
     def _all(self, generator: torch.Generator) -> list[list[int]]:
@@ -276,16 +274,16 @@ def paired(order: Sequence[int], groups: Sequence[str], generator: torch.Generat
     for index in order:
         members.setdefault(groups[index], []).append(index)
     # Clips that are alone in their group are paired with one another.
-    alone = [clips[0] for clips in members.values() if len(clips) == 1]
-    pools = [clips for clips in members.values() if len(clips) > 1] + ([alone] if alone else [])
+    singles = [clips[0] for clips in members.values() if len(clips) == 1]
+    pools = [clips for clips in members.values() if len(clips) > 1] + ([singles] if singles else [])
     pairs = []
     for clips in pools:
         pairs += [clips[i : i + 2] for i in range(0, len(clips) - 1, 2)]
         if len(clips) % 2:
             # Left over: it joins a clip that has a partner already; if it is alone in its pool, any other clip of the
             # epoch; if the epoch has no other clip, itself.
-            others = clips[:-1] or [index for index in order if index != clips[-1]] or clips
-            pairs.append([clips[-1], others[0]])
+            partners = clips[:-1] or [index for index in order if index != clips[-1]] or clips
+            pairs.append([clips[-1], partners[0]])
     return [pairs[i] for i in torch.randperm(len(pairs), generator=generator).tolist()]
 
 
@@ -300,8 +298,8 @@ def evened(batches: list[list[int]], world_size: int) -> list[list[int]]:
         # Halving the largest batch costs least: no clip is scored twice, and memory never grows.
         while len(batches) < up:
             largest = max(batches, key=len)
-            place, half = batches.index(largest), len(largest) // 2
-            batches[place : place + 1] = [largest[:half], largest[half:]]
+            number, half = batches.index(largest), len(largest) // 2
+            batches[number : number + 1] = [largest[:half], largest[half:]]
     else:
         singles = [[index] for batch in batches for index in batch]
         batches = [singles[i % clips] for i in range(-(-clips // world_size) * world_size)]
@@ -336,16 +334,16 @@ class ReferencePolicy:
 
     def eligible(self, target: Clip, *, any_mood: bool = False) -> list[Clip]:
         """Possible references of ``target``, never ``target`` itself; those that match best unless ``any_mood``."""
-        others = [clip for clip in self.candidates.get(target.identity, []) if clip.name != target.name]
-        if not others:
+        clips = [clip for clip in self.candidates.get(target.identity, []) if clip.name != target.name]
+        if not clips:
             raise FaceDiffError(
                 f"clip {target.name}: {target.identity} has no other clip that could be its style reference; add clips "
                 f"outside the test sentences, or train with data.reference=self"
             )
         if any_mood:
-            return others
-        alike = [c for c in others if all(c.attributes.get(k) == target.attributes.get(k) for k in self.same)]
-        return alike or others
+            return clips
+        alike = [c for c in clips if all(c.attributes.get(k) == target.attributes.get(k) for k in self.same)]
+        return alike or clips
 
     def evaluated(self, target: Clip) -> Clip:
         """The reference of ``target`` in evaluation; it depends on the target's name only."""
@@ -366,8 +364,8 @@ FeatureReader = Callable[[Clip], Tensor | None]
 class MotionDataset(Dataset[Sample]):
     """Samples of one split.
 
-    Training samples have a random window and a random reference; evaluation samples are whole clips whose reference
-    follows from the clip's name.
+    Training samples have a random window and a random reference; evaluation samples are whole clips with a
+    reference that follows from the clip's name.
 
     Args:
         corpus: the corpus that holds the clips.
@@ -456,7 +454,7 @@ class MotionDataset(Dataset[Sample]):
         frames = self.corpus.frames(clip)
         # A recording begins and ends without speech: of its two ends, the one nearer to the neutral face.
         mouth = np.ones(len(motion[0]), np.float32) if self.mouth is None else self.mouth
-        ends = [self.corpus.read_motion(clip, place, place + 1)[0].numpy() for place in (0, frames - 1)]
+        ends = [self.corpus.read_motion(clip, frame, frame + 1)[0].numpy() for frame in (0, frames - 1)]
         rest = min(ends, key=lambda face: float(np.square(face[mouth > 0]).sum()))
         example = Example(audio.numpy(), motion.numpy(), self.corpus.frame_rate, rest, mouth)
         changed = augmenter(example, seed)
@@ -466,18 +464,18 @@ class MotionDataset(Dataset[Sample]):
         """The text of a clip, or its sentence: clips for which it is equal have the same words and can be aligned."""
         return self.clips[index].sentence if self.texts is None else self.texts[index]
 
-    def pair(self, one: Pick, other: Pick) -> list[Sample]:
+    def pair(self, first: Pick, second: Pick) -> list[Sample]:
         """Two neighbours of a batch; if they say the same, their windows begin at the same sound.
 
         The first clip's window is random, the second one's begins at the frame that goes with the first one's.
         """
-        alike = one.index != other.index and self.says(one.index) == self.says(other.index)
+        picks, indices = (first, second), (first.index, second.index)
+        alike = first.index != second.index and self.says(first.index) == self.says(second.index)
         if self.aligner is None or self.window is None or not alike:
-            return [self.sample(one), self.sample(other)]
-        picks = (one, other)
-        counts = [self.corpus.frames(self.clips[pick.index]) for pick in picks]
-        paths = [self._path(self.aligner, *indices) for indices in ((one.index, other.index), (other.index, one.index))]
-        start, _ = self._window(counts[0], self.window, torch.Generator().manual_seed(one.seed))
+            return [self.sample(pick) for pick in picks]
+        counts = [self.corpus.frames(self.clips[index]) for index in indices]
+        paths = [self._path(self.aligner, *indices), self._path(self.aligner, *reversed(indices))]
+        start, _ = self._window(counts[0], self.window, torch.Generator().manual_seed(first.seed))
         # A window near the end of the second clip is moved back, so that it has its full length.
         begins = [start, max(0, min(int(paths[0][start]), counts[1] - self.window))]
         samples = [self.sample(pick, begin) for pick, begin in zip(picks, begins, strict=True)]
@@ -486,21 +484,21 @@ class MotionDataset(Dataset[Sample]):
             begin - (0 if sample.window is None else sample.window[0])
             for begin, sample in zip(begins, samples, strict=True)
         ]
-        for mine, theirs in ((0, 1), (1, 0)):
-            first, frames = firsts[mine], len(samples[mine].motion)
-            places = paths[mine][first : first + frames] - firsts[theirs]
-            outside = (places < 0) | (places >= len(samples[theirs].motion))
-            samples[mine] = replace(samples[mine], partner_frames=places.masked_fill(outside, -1))
+        for sample, partner in ((0, 1), (1, 0)):
+            begin, count = firsts[sample], len(samples[sample].motion)
+            frames = paths[sample][begin : begin + count] - firsts[partner]
+            outside = (frames < 0) | (frames >= len(samples[partner].motion))
+            samples[sample] = replace(samples[sample], partner_frames=frames.masked_fill(outside, -1))
         return samples
 
-    def _path(self, aligner: Aligner, index: int, other: int) -> Tensor:
+    def _path(self, aligner: Aligner, first: int, second: int) -> Tensor:
         """For each frame of a whole clip the frame of another one that says the same; computed once."""
-        if (index, other) not in self._alignments:
-            clips = [self.clips[index], self.clips[other]]
+        if (first, second) not in self._alignments:
+            clips = [self.clips[first], self.clips[second]]
             counts = [self.corpus.frames(clip) for clip in clips]
             audio = [self.corpus.read_audio(clip, 0, count) for clip, count in zip(clips, counts, strict=True)]
-            self._alignments[index, other] = aligner(audio[0], counts[0], audio[1], counts[1])
-        return self._alignments[index, other]
+            self._alignments[first, second] = aligner(audio[0], counts[0], audio[1], counts[1])
+        return self._alignments[first, second]
 
     def frames(self) -> list[int]:
         """Frames of every sample."""
@@ -526,21 +524,20 @@ class MotionDataset(Dataset[Sample]):
 
     def _features(self, clip: Clip, start: int, stop: int, frames: int) -> Tensor | None:
         """The steps of the whole clip's features that lie in frames ``start`` to ``stop``."""
-        whole = self.features(clip) if self.features is not None else None
-        if whole is None:
+        features = self.features(clip) if self.features is not None else None
+        if features is None:
             return None
-        per_frame = len(whole) / frames
-        first = min(round(start * per_frame), len(whole) - 1)
-        return whole[first : max(first + 1, math.ceil(stop * per_frame))].float()
+        per_frame = len(features) / frames
+        first = min(round(start * per_frame), len(features) - 1)
+        return features[first : max(first + 1, math.ceil(stop * per_frame))].float()
 
     def _decoy(self, index: int, frames: int) -> Tensor | None:
         """Speech of the next clip with another sentence, repeated or cut to ``frames``; None if there is none."""
-        own = self.clips[index]
         order = self.clips[index + 1 :] + self.clips[:index]
-        others = [clip for clip in order if clip.sentence != own.sentence]
-        if not others:
+        clip = next((clip for clip in order if clip.sentence != self.clips[index].sentence), None)
+        if clip is None:
             return None
-        audio = self.corpus.read_audio(others[0], 0, self.corpus.frames(others[0]))
+        audio = self.corpus.read_audio(clip, 0, self.corpus.frames(clip))
         length = samples_for(frames, self.corpus.frame_rate)
         return audio.repeat(-(-length // len(audio)))[:length]
 

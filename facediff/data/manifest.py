@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from facediff.errors import FaceDiffError
-from facediff.utils.hints import check_number
-from facediff.utils.limits import FRAME_RATES, check_format, quoted
+from facediff.utils.limits import FRAME_RATES, check_format
 from facediff.utils.plain_files import load_json
+from facediff.utils.ranges import Range
+from facediff.utils.records import Text, read_record
 
 FORMAT = 1
 """Goes up when a field changes its meaning; new fields do not count. Folders without the field are of format 1."""
 
 REMEDY = "prepare the folder again, or remove the file"
-TEXTS = ("corpus", "person", "unit")
 LONGEST = 200
-"""Longest such text or name of an identity, in characters: they are repeated in messages, checkpoints and file
-names."""
+"""Longest text or name of an identity, in characters: they are repeated in messages, checkpoints and file names."""
+ShortText = Annotated[str, Text(r"[^\x00-\x1f\x7f-\x9f]*", "a short text", LONGEST)]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The fields of a manifest that are read by name; it may have others."""
+
+    frame_rate: Annotated[float, Range(*FRAME_RATES)] | None = None
+    n_vertices: Annotated[int, Range(1, 10**9)] | None = None
+    corpus: ShortText = ""
+    person: ShortText = ""
+    unit: ShortText = ""
 
 
 def load_manifest(path: Path, *, remedy: str = REMEDY) -> dict[str, Any]:
@@ -35,17 +47,10 @@ def load_manifest(path: Path, *, remedy: str = REMEDY) -> dict[str, Any]:
 
 
 def read_manifest(root: Path) -> dict[str, Any]:
-    """``manifest.json`` of a folder, its facts checked; empty if there is none."""
+    """``manifest.json`` of a folder, its fields checked; empty if there is none."""
     path = root / "manifest.json"
     if not path.is_file():
         return {}
     manifest = load_manifest(path)
-    if manifest.get("frame_rate") is not None:
-        check_number(path, "frame_rate", manifest["frame_rate"], *FRAME_RATES, remedy=REMEDY)
-    if manifest.get("n_vertices") is not None:
-        check_number(path, "n_vertices", manifest["n_vertices"], 1, whole=True, remedy=REMEDY)
-    for field in TEXTS:
-        text = manifest.get(field, "")
-        if text is not None and not (isinstance(text, str) and text.isprintable() and len(text) <= LONGEST):
-            raise FaceDiffError(f"{path}: {field} is {quoted(text)}; expected a short text; {REMEDY}")
+    read_record(Manifest, manifest, path, remedy=REMEDY, strict=False)
     return manifest

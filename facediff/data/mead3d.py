@@ -6,7 +6,7 @@ import re
 from typing import Any, ClassVar, Literal
 
 from facediff import registry
-from facediff.data.corpus import FLAME_REGIONS, FLAME_SOURCES, Circulating, Clip
+from facediff.data.corpus import FLAME_SOURCES, Clip
 from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.utils.licences import Commercial
 
@@ -33,7 +33,7 @@ class Mead3D(SpeechMotionDataModule):
             validation and test (test A). ``identity`` is EMOTE's: 32 speakers train, 7 validate, 8 test (test B).
             ``both`` trains and validates as ``sentence`` does and tests on both: test A, and EMOTE's 8 test speakers
             as test B. The dual path's paper names none.
-        options: those of every data module.
+        options: as for every data module.
     """
 
     corpus_name: ClassVar[str] = "mead3d"
@@ -59,7 +59,6 @@ class Mead3D(SpeechMotionDataModule):
         "the inferno repository, github.com/radekd91/inferno); `facediff data prepare mead3d RAW OUT --flame MODEL` "
         "makes the corpus folder from them."
     )
-    circulating: ClassVar[Circulating] = Circulating(regions=FLAME_REGIONS)
 
     def __init__(self, *, split: Literal["sentence", "identity", "both"] = "sentence", **options: Any) -> None:  # noqa: ANN401
         super().__init__(**options)

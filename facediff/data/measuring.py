@@ -44,7 +44,7 @@ def measure_scale(corpus: Corpus, clips: Sequence[Clip], trainer: Trainer | None
     Args:
         corpus: the corpus.
         clips: its training clips.
-        trainer: the trainer whose processes share the result; None outside training.
+        trainer: its processes share the result; None outside training.
     """
 
     def measure() -> npt.NDArray[np.float64]:
@@ -70,9 +70,8 @@ def measure_components(
     weighted = "" if weights is None else hashlib.sha256(weights.detach().cpu().numpy().tobytes()).hexdigest()
 
     def measure() -> npt.NDArray[np.float32]:
-        frames_per_clip = min(
-            FRAMES, max(2, PRINCIPAL_NUMBERS // (corpus.dims * corpus.n_vertices * max(1, len(clips))))
-        )
+        coordinates = corpus.dims * corpus.n_vertices * max(1, len(clips))
+        frames_per_clip = min(FRAMES, max(2, PRINCIPAL_NUMBERS // coordinates))
         # Clips begin and end in silence. Of a large mesh only two frames of each are read: in every clip at another
         # place, so that together they lie everywhere.
         spread = [
@@ -86,15 +85,15 @@ def measure_components(
             frames = frames @ weights.T.cpu().double()
         elif weights is not None:
             frames *= weights.cpu()
-        # The eigenvectors of the frames' products with one another give the same components as those of the
+        # The eigenvectors of the frames' products with one another give the same components as the eigenvectors of the
         # covariance, which for a large mesh would not fit into memory. The smaller of the two is decomposed.
         few = len(frames) <= frames.shape[1]
         values, vectors = torch.linalg.eigh(frames @ frames.T if few else frames.T @ frames)
-        kept = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
+        largest = [i for i in reversed(range(len(values))) if values[i] > 1e-10 * values[-1]][:count]
         if few:
-            shapes = vectors[:, kept].T @ frames / len(frames) ** 0.5
+            shapes = vectors[:, largest].T @ frames / len(frames) ** 0.5
         else:
-            shapes = vectors[:, kept].T * (values[kept, None] / len(frames)).sqrt()
+            shapes = vectors[:, largest].T * (values[largest, None] / len(frames)).sqrt()
         return torch.cat([mean[None], shapes]).float().numpy()
 
     what = ("components", FRAMES, PRINCIPAL_NUMBERS, count, weighted)
@@ -111,7 +110,7 @@ def measure_windows(
 ) -> Tensor:
     """Covariance (K, width, width) of K projections of the motion over the frames of a window, about zero.
 
-    Over windows and not from autocovariances: those of clips of a few seconds leak a hundredth of the power of the slow
+    Over windows and not from autocovariances, which in clips of a few seconds leak a hundredth of the power of the slow
     movement into the highest frequencies, more than there is.
     """
     probe = torch.randn(1, 2, corpus.n_vertices, corpus.dims, generator=torch.Generator().manual_seed(0))

@@ -35,15 +35,14 @@ class MixedBatches(ResumableBatches[tuple[str, list[Pick]]]):
     def __iter__(self) -> Iterator[tuple[str, list[Pick]]]:
         """This process's batches of the current epoch, with the corpus of each."""
         counts = {name: len(part) for name, part in self.parts.items()}
-        # The k-th of a corpus's n batches stands at (k + ½) / n of the epoch, whatever the others have.
-        places = [((k + 0.5) / count, name) for name, count in counts.items() for k in range(count)]
-        order = [name for _, name in sorted(places)]
-        done = order[: self.done]
+        # The k-th of a corpus's n batches stands at (k + ½) / n of the epoch, independently of the others.
+        positions = [((k + 0.5) / count, name) for name, count in counts.items() for k in range(count)]
+        order = [name for _, name in sorted(positions)]
         for name, part in self.parts.items():
             part.seed = self.seed
-            part.resume(self.epoch, done.count(name))
+            part.resume(self.epoch, order[: self.done].count(name))
         remaining = {name: iter(part) for name, part in self.parts.items()}
-        for name in order[len(done) :]:
+        for name in order[self.done :]:
             yield name, next(remaining[name])
 
 
@@ -63,8 +62,8 @@ class MixedDataset(Dataset[tuple[str, list[Sample]]]):
 
     def __getitem__(self, picks: tuple[str, list[Pick]] | int) -> tuple[str, list[Sample]]:
         """The picked clips; a bare number, which Lightning asks for in a rehearsal, is one clip of the first corpus."""
-        name, own = (next(iter(self.parts)), picks) if isinstance(picks, int) else picks
-        return name, self.parts[name][own]
+        name, clips = (next(iter(self.parts)), picks) if isinstance(picks, int) else picks
+        return name, self.parts[name][clips]
 
 
 def collate_with_face(batch: Any) -> Batch:  # noqa: ANN401 - what a MixedDataset gives; a loader's type says nothing
@@ -77,7 +76,7 @@ def mixed_loader(loaders: Mapping[str, DataLoader[Any]], **options: Any) -> Resu
     """One loader for several corpora.
 
     Args:
-        loaders: that of each corpus, of a :class:`BatchDataset` and :class:`ClipBatches`, by the corpus's name.
+        loaders: one for each corpus, of a :class:`BatchDataset` and :class:`ClipBatches`, by the corpus's name.
         options: further ones of the loader.
     """
     samples: Any = MixedDataset({name: cast(BatchDataset, loader.dataset) for name, loader in loaders.items()})

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from facediff import registry
-from facediff.data.corpus import Clip, read_clip_table
-from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.data.corpus import Clip
+from facediff.data.datamodule import SpeechMotionDataModule, by_speaker, split_in_table
 from facediff.data.packed.stores import is_packed
 from facediff.data.person.importer import splits
 from facediff.data.recordings import USUAL_SUFFIXES, RecordingFolder
@@ -29,15 +29,20 @@ class ParametricDataModule(SpeechMotionDataModule):
     ``clips.csv`` decides which split a clip belongs to, by its column ``split`` (train, val, test_a); without it, the
     last 15 % of each speaker's clips by name are for the test and the 10 % before them for validation.
 
+    Class attributes:
+        suffixes: of the files with values.
+        names_channels: whether files name their channels, so that a folder is recognised without its layout.
+
     Args:
         root: the folder.
         extra_identities: speakers of the folder to train on; all that it has if None. Test clips of others are test_b.
-        options: those of every data module.
+        options: as for every data module.
     """
 
     unit = "m"
     identities: list[str] = []  # noqa: RUF012 - of a class, as those of all corpora; those of a folder are found in it
     suffixes: ClassVar[tuple[str, ...]] = USUAL_SUFFIXES
+    names_channels: ClassVar[bool] = True
     layout_name: str | None = None
 
     def __init__(self, *, root: str, extra_identities: list[str] | None = None, **options: Any) -> None:  # noqa: ANN401
@@ -53,7 +58,7 @@ class ParametricDataModule(SpeechMotionDataModule):
 
     @classmethod
     def check_root(cls, root: str | Path) -> None:
-        """Refuse a folder without recordings, whose speakers are the model's identities."""
+        """Refuse a folder without recordings: their speakers are the model's identities."""
         folder = Path(root).expanduser()
         if is_packed(root):  # is refused when it is read
             return
@@ -72,24 +77,19 @@ class ParametricDataModule(SpeechMotionDataModule):
 
     @cached_property
     def _splits(self) -> dict[str, str]:
-        listed = {name: row["split"] for name, row in read_clip_table(self.root).items() if row.get("split")}
-        clips = [clip for clip in self.corpus.clips.values() if clip.root == self.root]
+        """The splits of clips by the order of their speaker's clips."""
         result: dict[str, str] = {}
-        for speaker in {clip.identity for clip in clips}:
-            own = sorted(clip.name for clip in clips if clip.identity == speaker)
-            result |= dict(zip(own, splits(len(own)), strict=True))
-        result |= {name: split for name, split in listed.items() if name in result}
-        for name, split in result.items():
-            if split not in ("train", "val", "test", "test_a", "none"):
-                raise FaceDiffError(
-                    f"{self.root / 'clips.csv'}: split of {name} is {split!r}; expected train, val, test_a or none"
-                )
-        return {name: "test_a" if split == "test" else split for name, split in result.items()}
+        for clips in by_speaker(clip for clip in self.corpus.clips.values() if clip.root == self.root).values():
+            names = sorted(clip.name for clip in clips)
+            result |= dict(zip(names, splits(len(names)), strict=True))
+        return result
 
     def split_of(self, clip: Clip) -> str | None:
         """By ``clips.csv``, or by the order of each speaker's clips."""
+        if clip.attributes.get("split"):
+            return split_in_table(clip)
         split = self._splits[clip.name]
-        return None if split == "none" else split
+        return "test_a" if split == "test" else split
 
     def find_split(self, clip: Clip) -> str | None:
         """As of every data module, but clips of no split stay so, and speakers who are not trained on are unseen."""
@@ -110,10 +110,10 @@ class Beat(ParametricDataModule):
 
     Args:
         root: the folder.
-        conversations: use recordings of conversations (types 1, 3, 5, 7) as well as those of speeches (0, 2, 4, 6).
+        conversations: use recordings of conversations (types 1, 3, 5, 7) as well as of speeches (0, 2, 4, 6).
         split: ``order`` as in every folder of recordings, or ``official``, BEAT's own by the recordings' numbers
             (:func:`official_split`), which is of English only.
-        options: those of every data module.
+        options: as for every data module.
     """
 
     corpus_name: ClassVar[str] = "beat"
@@ -142,7 +142,7 @@ class Beat(ParametricDataModule):
 
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
-        """``26_reamey_0_103_103``: speaker, name, type, first and last number of what is said."""
+        """``26_reamey_0_103_103``: speaker, name, type, first and last number of the text."""
         match = re.fullmatch(r"(\d{1,2}_[a-z]+)_([0-7])_(\d{1,3})_(\d{1,3})", name)
         if match is None:
             return None
@@ -187,7 +187,7 @@ FOUR_HOURS = frozenset((1, 2, 3, 4, 6, 7, 8, 9, 11, 21))
 
 
 def official_split(speaker: int, kind: int, number: int) -> str | None:
-    """The split of an English recording by BEAT's own rule; None for what it has in none, and for other languages.
+    """The split of an English recording by BEAT's own rule; None for recordings in none, and for other languages.
 
     Of speakers who recorded one hour, BEAT cuts the first recording of each emotion, and the first conversation, into a
     half for the test and one for validation; whole recordings are not cut here and go to the test.
@@ -195,23 +195,23 @@ def official_split(speaker: int, kind: int, number: int) -> str | None:
     Args:
         speaker: number of the speaker.
         kind: of the recording: 0 English speech, 1 English conversation.
-        number: first number of what is said.
+        number: first number of the text.
 
     Example:
         >>> official_split(2, 0, 65), official_split(2, 0, 72), official_split(2, 0, 9), official_split(5, 0, 40)
         ('test_a', 'val', 'train', None)
     """
-    long = speaker in FOUR_HOURS
+    four_hours = speaker in FOUR_HOURS
     if kind == 1:
-        others = {12: "val", **dict.fromkeys(range(2, 12), "train")} if long else dict.fromkeys((0, 2, 3, 4), "train")
-        return "test_a" if number == 1 else others.get(number)
+        train = range(2, 12) if four_hours else (0, 2, 3, 4)
+        return {1: "test_a", **dict.fromkeys(train, "train"), **({12: "val"} if four_hours else {})}.get(number)
     firsts = {last + 1 for last, _ in EMOTIONS[:-1]}
     lasts = {last for last, _ in EMOTIONS[1:]}
     if kind or not 1 <= number <= EMOTIONS[-1][0]:
         return None
-    if number <= (8 if long else 4) or number in firsts:
+    if number <= (8 if four_hours else 4) or number in firsts:
         return "test_a"
-    if long:
+    if four_hours:
         return "val" if 57 <= number <= 64 or number in lasts else "train"
     if number <= 8:
         return "val"
@@ -226,7 +226,7 @@ class LiveLink(ParametricDataModule):
 
     Args:
         root: the folder.
-        options: those of every data module.
+        options: as for every data module.
     """
 
     corpus_name: ClassVar[str] = "live_link"
@@ -234,10 +234,7 @@ class LiveLink(ParametricDataModule):
     suffixes: ClassVar[tuple[str, ...]] = (".csv",)
     space: Space = layout("live_link")
     n_vertices = len(layout("live_link").channels)
-    licence: ClassVar[str] = "of whoever recorded it"
-
-    def __init__(self, *, root: str, **options: Any) -> None:  # noqa: ANN401
-        super().__init__(root=root, **options)
+    licence: ClassVar[str] = "of its owner"
 
 
 @registry.corpus.register("FlameClips")
@@ -248,15 +245,16 @@ class FlameClips(ParametricDataModule):
         root: the folder.
         layout: name of the files' layout, such as flame_diffposetalk; an array does not say it.
         version: of FLAME: coefficients of 2020 and 2023 cannot be exchanged, and checkpoints keep it.
-        options: those of every data module.
+        options: as for every data module.
     """
 
     corpus_name: ClassVar[str] = "flame_clips"
+    names_channels: ClassVar[bool] = False
     frame_rate: ClassVar[float] = 25.0
     suffixes: ClassVar[tuple[str, ...]] = (".npz", ".npy", ".pt", ".hdf5")
     space: Space = layout("flame_diffposetalk")
     n_vertices = len(layout("flame_diffposetalk").channels)
-    licence: ClassVar[str] = "of whoever recorded it, and FLAME's"
+    licence: ClassVar[str] = "of its owner, and FLAME's"
 
     def __init__(self, *, root: str, layout: str, version: str = "", **options: Any) -> None:  # noqa: ANN401
         flame = [name for name, entry in LAYOUTS.items() if entry.space.kind == "flame"]

@@ -48,10 +48,10 @@ class People(SpeechMotionDataModule):
 
     Args:
         root: the corpus folder.
-        extra_identities: people to train on; all but those of test B if None.
+        extra_identities: people to train on; all but the people of test B if None.
         test_people: share of the people who are test B.
         batch_size: clips a batch; used where no frame budget is given.
-        options: those of every data module.
+        options: of every data module.
     """
 
     corpus_name: ClassVar[str] = "people"

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from facediff import registry
 from facediff.data.corpus import Clip, Corpus
-from facediff.data.datamodule import Count, SpeechMotionDataModule, person_name
+from facediff.data.datamodule import Count, SpeechMotionDataModule, person_name, split_in_table
 from facediff.data.manifest import read_manifest
 from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER, ChannelFolder, ClipStorage
 from facediff.errors import FaceDiffError
@@ -42,12 +42,12 @@ def channel_space() -> Space:
     Yaw is to the face's left, pitch down, roll towards its right shoulder: turns about y, x and z, as facediff.spaces
     takes Euler angles.
     """
-    named = tuple(f"{turn}{angle}" for turn in TURNS for angle in ("Yaw", "Pitch", "Roll"))
+    angles = tuple(f"{turn}{angle}" for turn in TURNS for angle in ("Yaw", "Pitch", "Roll"))
     identity = f"{puppet.CORPUS} {puppet.GENERATOR} {' '.join(SHAPES)}"
     first = len(SHAPES)
     return Space(
         "arkit",
-        (*SHAPES, *named),
+        (*SHAPES, *angles),
         version="arkit",
         rig=puppet.CORPUS,
         # The shapes follow from the generator, to the last digit only on one machine.
@@ -86,9 +86,9 @@ class PuppetChannels(ChannelFolder):
         return np.concatenate([weights, turns], axis=1).astype(np.float32)
 
 
-def cache_root(seed: int = 0, drawn: int = 0, people: Sequence[str] = ()) -> Path:
+def cache_root(seed: int = 0, drawn_speakers: int = 0, people: Sequence[str] = ()) -> Path:
     """The corpus's folder: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
-    more = f"-drawn{drawn}" if drawn else ""
+    more = f"-drawn{drawn_speakers}" if drawn_speakers else ""
     more += f"-people{len(people)}" if people else ""
     # Two folders of recordings may have equally many speakers.
     if people and people[0].startswith(ALIGNED):
@@ -102,19 +102,13 @@ def made_root(seed: int) -> Path | None:
     return next((folder for folder in (root, *sorted(root.parent.glob(f"{root.name}-*"))) if folder.is_dir()), None)
 
 
-def split_in_table(clip: Clip) -> str | None:
-    """The split that the corpus's table of clips names; None for style references."""
-    split = clip.attributes.get("split")
-    return None if split == "references" else split
-
-
 @registry.corpus.register("Puppet")
 class Puppet(SpeechMotionDataModule):
     """The built-in corpus: a head made by code that speaks with real speech synthesisers; made on first use.
 
     Synthetic: scores on it say nothing about real people. 25 frames per second, metres. Six seen speakers say 32
-    sentences in training and 10 on test A, four unseen ones 10 on test B, and test C has voices that nobody is trained
-    with.
+    sentences in training and 10 on test A, four unseen ones 10 on test B, and test C has voices outside the training
+    data.
 
     Args:
         root: the corpus folder; the user's cache folder if None.
@@ -124,11 +118,11 @@ class Puppet(SpeechMotionDataModule):
         people_voices: let every second drawn speaker speak with a voice made from recordings of people, as far as flite
             and Festival are installed.
         recordings: folder of people's recordings, ``SPEAKER/NAME.wav`` or ``.flac`` with ``NAME.TextGrid``: each drawn
-            speaker speaks with those of one person.
+            speaker speaks with the recordings of one person.
         motion: ``vertices``, or ``arkit`` for the truth as it is kept: ARKit's 52 shapes and two of
             the tongue, the turns of head and eyes; see docs/parameters.md.
         batch_size: clips a batch; used where no frame budget is given.
-        options: those of every data module.
+        options: as for every data module.
     """
 
     corpus_name: ClassVar[str] = "puppet"
@@ -140,7 +134,7 @@ class Puppet(SpeechMotionDataModule):
     identities = list(SEEN)
     mesh_files: ClassVar[tuple[str, ...]] = ("PUPPET.ply",)
     reference_attributes: ClassVar[tuple[str, ...]] = ("mood",)
-    # Face and motion come from this package's code. The program espeak-ng, which speaks, is under the GPL 3, whose
+    # Face and motion come from this package's code. The program espeak-ng, which speaks, is under the GPL 3; its
     # terms cover the program and not its output (gnu.org/licenses/gpl-faq.html#GPLOutput).
     licence: ClassVar[str] = "Apache-2.0"
     languages: ClassVar[tuple[str, ...]] = ("en",)
@@ -165,11 +159,11 @@ class Puppet(SpeechMotionDataModule):
         people = puppet.people_voices() if people_voices else ()
         if recordings is not None:
             people = tuple(f"{ALIGNED}:{speaker}" for speaker in speakers_of(Path(recordings).expanduser().absolute()))
-        drawn = drawn_names(drawn_speakers)
+        invented = drawn_names(drawn_speakers)
         super().__init__(
             root=str(cache_root(seed, drawn_speakers, people)) if root is None else root,
             batch_size=batch_size,
-            extra_identities=[*(extra_identities or []), *drawn],
+            extra_identities=[*(extra_identities or []), *invented],
             **options,
         )
         if str(read_manifest(self.root).get("generator", "")).startswith("1."):
@@ -177,13 +171,13 @@ class Puppet(SpeechMotionDataModule):
                 f"{self.root}: holds the first edition of the built-in corpus, which 1.1 was the last to read; choose "
                 f"another folder, or remove it"
             )
-        self.seed, self.drawn, self.voices = seed, drawn, people
+        self.seed, self.drawn, self.voices = seed, invented, people
         if motion != "vertices":
             self.space = channel_space()
             self.n_vertices = len(self.space.channels)
         self.compared_speakers = (*SEEN, *UNSEEN)
         # The first identity is animated unless another is named, so it is one of the cast, not a drawn one.
-        self.identities = [*(name for name in self.identities if name not in drawn), *drawn]
+        self.identities = [*(name for name in self.identities if name not in invented), *invented]
 
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
@@ -204,7 +198,7 @@ class Puppet(SpeechMotionDataModule):
         return Corpus(self.root, type(self).n_vertices, self.frame_rate, parse=self.parse_name)
 
     def deltas(self) -> dict[str, Tensor]:
-        """The shapes of those of the cast; drawn speakers have theirs in the corpus's folder only."""
+        """The shapes of the cast; drawn speakers have theirs in the corpus's folder only."""
         files = {name: self.root / RIGS_FOLDER / f"{name}.npy" for name in sorted(self.corpus.templates)}
         return {
             name: torch.from_numpy(np.array(open_vertices(file, type(self).n_vertices)[1:], np.float32))
@@ -215,7 +209,7 @@ class Puppet(SpeechMotionDataModule):
 
     def split_of(self, clip: Clip) -> str | None:
         """By the table of clips."""
-        return split_in_table(clip)
+        return split_in_table(clip) if clip.attributes else None
 
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]]:
         """Random words by the training speakers."""
@@ -228,7 +222,7 @@ class Puppet(SpeechMotionDataModule):
         return puppet.speak_clip(puppet.PerformedClip(speaker, "train", 1, text, "neutral", voice)).samples
 
     def stores_reference(self, identity: str) -> bool:
-        """Those of the cast: drawn speakers are there to learn from, and 42 of their clips take 90 MB."""
+        """True for the cast: drawn speakers are there to learn from, and 42 of their clips take 90 MB."""
         return identity not in self.drawn
 
     def default_reference(self, clips: list[Clip]) -> Clip:
@@ -247,7 +241,7 @@ class PuppetMask(SpeechMotionDataModule):
         root: the corpus folder; the user's cache folder if None.
         seed: seed of the corpus; another seed makes another corpus.
         batch_size: clips a batch; used where no frame budget is given.
-        options: those of every data module.
+        options: as for every data module.
     """
 
     corpus_name: ClassVar[str] = "puppet_mask"
@@ -279,12 +273,12 @@ class PuppetMask(SpeechMotionDataModule):
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
         if self.packed is None:
-            puppet.generate(self.root, seed=self.seed, workers=min(4, processors()), production=puppet.MASK)
+            puppet.generate(self.root, seed=self.seed, workers=min(4, processors()), variant=puppet.MASK)
         super().prepare_data()
 
     def split_of(self, clip: Clip) -> str | None:
         """By the table of clips."""
-        return split_in_table(clip)
+        return split_in_table(clip) if clip.attributes else None
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """A clip in neutral mood."""

@@ -16,7 +16,6 @@ from facediff.spaces.operations import at_times, permuted
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
-from facediff.utils.limits import quoted
 
 USUAL_SUFFIXES = (".csv", ".json")
 
@@ -60,10 +59,6 @@ class RecordingFolder(ChannelFolder):
             sound = next((sound for sound in beside if sound.is_file()), sounds.get(path.stem))
             if sound is None or not sound.is_file():
                 continue
-            if not path.stem.isprintable():
-                raise FaceDiffError(
-                    f"{self.root}: has a file {quoted(path.name)}; rename it, its name cannot be printed"
-                )
             if path.stem in files:
                 raise FaceDiffError(f"{path}: is named as {files[path.stem][0]} is; rename one of them")
             files[path.stem] = (path, sound)
@@ -82,10 +77,10 @@ class RecordingFolder(ChannelFolder):
         return read_parameters(self.path_of(name), layout=self.layout)
 
     def values(self, name: str) -> npt.NDArray[np.floating]:
-        """A recording's values in the corpus's space and at its frame rate; what was dropped is interpolated."""
+        """A recording's values in the corpus's space and at its frame rate; dropped frames are interpolated."""
         path = self.path_of(name)
-        facts = path.stat()
-        parts = (path.resolve(), facts.st_size, facts.st_mtime_ns, self.space.state(), self.frame_rate, self.layout)
+        status = path.stat()
+        parts = (path.resolve(), status.st_size, status.st_mtime_ns, self.space.state(), self.frame_rate, self.layout)
         key = ArrayStore.key(*parts)
         stored = self._store.get(key)
         if stored is not None:

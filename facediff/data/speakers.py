@@ -31,17 +31,15 @@ class MeanFaces:
     """
 
     def __init__(self, data: SpeechMotionDataModule) -> None:
-        by_speaker: dict[str, list[Clip]] = {}
+        clips_of: dict[str, list[Clip]] = {}
         for clip in data.clips("train"):
-            by_speaker.setdefault(clip.identity, []).append(clip)
-        if not by_speaker:
-            raise FaceDiffError(f"{data.root}: no training clip; expected some, to compute the speakers' mean faces")
+            clips_of.setdefault(clip.identity, []).append(clip)
         self.faces: dict[str, Tensor] = {}
-        for speaker, clips in by_speaker.items():
-            chosen = spread(clips)
-            frames = [data.corpus.frames(clip) for clip in chosen]
+        for speaker, clips in clips_of.items():
+            clips = spread(clips)
+            frames = [data.corpus.frames(clip) for clip in clips]
             total = torch.zeros(data.n_vertices, data.space.dims, dtype=torch.float64)
-            for clip, count in zip(chosen, frames, strict=True):
+            for clip, count in zip(clips, frames, strict=True):
                 total += count * data.corpus.mean_motion(clip)
             self.faces[speaker] = (total / sum(frames)).float()
         self.of_all = torch.stack(list(self.faces.values())).mean(0)
@@ -78,4 +76,4 @@ def spread(clips: Sequence[Clip]) -> list[Clip]:
     """At most :data:`MOST` of the clips, evenly spread."""
     if len(clips) <= MOST:
         return list(clips)
-    return [clips[int(place)] for place in torch.linspace(0, len(clips) - 1, MOST).round()]
+    return [clips[int(index)] for index in torch.linspace(0, len(clips) - 1, MOST).round()]

@@ -13,7 +13,7 @@ from facediff.errors import FaceDiffError
 from facediff.spaces import Space
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore, open_array, open_vertices
-from facediff.utils.limits import COORDINATE, in_range, quoted
+from facediff.utils.limits import COORDINATE, in_range
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
 """Folders with absolute vertices, in order of preference; the second is ProbTalk3D's."""
@@ -69,19 +69,12 @@ class ClipFolder:
     def __init__(self, root: Path, n_vertices: int) -> None:
         self.root = root
         self.n_vertices = n_vertices
-        self._whole: set[Path] = set()
+        self._complete: set[Path] = set()
 
     def names(self) -> list[str]:
         """The clips that have both files, sorted."""
-        names = []
-        for name in sorted(path.stem for path in (self.root / "wav").glob("[!.]*.wav")):
-            if not name.isprintable():
-                raise FaceDiffError(
-                    f"{self.root / 'wav'}: has a file {quoted(name)}; rename it, its name cannot be printed"
-                )
-            if self.path_of(name).is_file():
-                names.append(name)
-        return names
+        names = sorted(path.stem for path in (self.root / "wav").glob("[!.]*.wav"))
+        return [name for name in names if self.path_of(name).is_file()]
 
     def path_of(self, name: str) -> Path:
         """The file with a clip's motion."""
@@ -93,12 +86,12 @@ class ClipFolder:
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
-        return read_stretch(self.root / "wav" / f"{name}.wav", first, length, store, self._whole)
+        return read_stretch(self.root / "wav" / f"{name}.wav", first, length, store, self._complete)
 
     def version(self, name: str) -> object:
         """Size and time of the clip's motion file."""
-        facts = self.path_of(name).stat()
-        return facts.st_size, facts.st_mtime_ns
+        status = self.path_of(name).stat()
+        return status.st_size, status.st_mtime_ns
 
 
 class ChannelFolder(ClipFolder):
@@ -271,9 +264,9 @@ def refuse_out_of_range(vertices: npt.NDArray[np.float32], numbers: Sequence[int
         source: the clip's file.
     """
     if not in_range(vertices):
-        bad = int(np.argmax(~(np.abs(vertices) <= COORDINATE).all((1, 2))))
+        index = int(np.argmax(~(np.abs(vertices) <= COORDINATE).all((1, 2))))
         raise FaceDiffError(
-            f"{source}: frame {numbers[bad]} holds NaN, infinity or a coordinate beyond {COORDINATE:g} (counted from "
+            f"{source}: frame {numbers[index]} holds NaN, infinity or a coordinate beyond {COORDINATE:g} (counted from "
             f"0); remove the clip"
         )
 

@@ -6,7 +6,7 @@ import re
 from typing import ClassVar
 
 from facediff import registry
-from facediff.data.corpus import FLAME_REGIONS, FLAME_SOURCES, Circulating, Clip
+from facediff.data.corpus import FLAME_SOURCES, Circulating, Clip
 from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.utils.licences import Commercial
 
@@ -57,7 +57,7 @@ class Vocaset(SpeechMotionDataModule):
         "makes the corpus folder from its files."
     )
     circulating: ClassVar[Circulating] = Circulating(
-        templates={"2fc95570": "TalkingStyle and DiffSpeaker"}, regions=FLAME_REGIONS, incomplete=True
+        templates={"2fc95570": "TalkingStyle and DiffSpeaker"}, incomplete=True
     )
 
     @classmethod

@@ -23,10 +23,10 @@ from facediff.pipelines.trained import open_pipeline
 from facediff.speech.audio import read_recording
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.batch import FileTask, Recipe, run_batch
-from facediff.utils.destinations import refuse_overwriting
 from facediff.utils.files import check_writable, locked, remove_partial
 from facediff.utils.hub import is_exported, may_have_weights, model_files
 from facediff.utils.jobs import PerWorker, is_cluster
+from facediff.utils.output_paths import refuse_overwriting
 from facediff.utils.tables import print_table
 
 LOCK = ".facediff-batch.lock"

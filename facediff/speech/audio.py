@@ -56,9 +56,6 @@ BLOCK = 1 << 18
 HOLE = 0.05
 """Seconds of sound that may be missing between two packets of a video before they count as lost."""
 
-LENGTH_IS_KNOWN = ("WAV", "WAVEX", "RF64", "AIFF")
-"""Formats whose number of samples follows from the size of the file."""
-
 UNKNOWN = 1 << 62
 """libsndfile gives a length above this where a stream does not tell it."""
 
@@ -125,7 +122,7 @@ def _rate_to_play(rate: float) -> int:
 
 def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.floating]:
     """Mono, where all samples are in range."""
-    peak = float(np.maximum(samples.max(initial=0.0), -samples.min(initial=0.0)))  # without a copy of all samples
+    peak = float(np.abs(samples).max(initial=0.0))
     if not len(samples) or not peak <= LOUDEST:
         raise FaceDiffError(
             f"{name}: holds no samples, or up to {peak:g}; expected speech of finite numbers with a full scale of 1"
@@ -188,23 +185,15 @@ def _decoded(file: Any, path: object, most: float | None) -> tuple[npt.NDArray[n
     known = 0 <= declared < UNKNOWN
     _check_length(path, declared / rate if known else 0, most)
     parts, decoded = [], 0
-    # A long recording fits once into memory, not twice.
-    samples = np.empty(declared, np.float32) if known and file.format in LENGTH_IS_KNOWN else None
     while len(block := file.read(max(1, BLOCK // file.channels), dtype="float32", always_2d=True)):
-        mono = block[:, 0].copy() if file.channels == 1 else block.mean(axis=1)
-        if samples is None:
-            parts.append(mono)
-        else:
-            samples[decoded : decoded + len(mono)] = mono
         decoded += len(block)
         _check_length(path, decoded / rate, most)
+        parts.append(block[:, 0].copy() if file.channels == 1 else block.mean(axis=1))
     # Without a frame that tells the number of frames, the length of an mp3 is an estimate.
     if known and decoded < declared and file.format != "MP3":
         raise FaceDiffError(
             f"{path}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
         )
-    if samples is not None:
-        return samples, rate
     return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
 
 

@@ -417,9 +417,8 @@ class Openness:
 def openness(speech: Wave, frames: int, frame_rate: float, gate: VoiceGate) -> npt.NDArray[np.float32]:
     """How far a mouth may be open in each frame (frames,) of a whole recording (S,); see :class:`Openness`."""
     found = Openness(gate, frame_rate)
-    # By the second, since what a gate computes is several times as large as the speech.
-    parts = [found.feed(speech[start : start + SAMPLE_RATE]) for start in range(0, len(speech), SAMPLE_RATE)]
-    return np.concatenate([*parts, found.finish(frames)])[:frames]
+    parts = [found.feed(speech), found.finish(frames)]
+    return np.concatenate(parts)[:frames]
 
 
 def toward_rest(
@@ -467,28 +466,23 @@ def speech_problems(speech: Wave) -> list[str]:
         >>> speech_problems(np.zeros(16000))
         ['is silent']
     """
-    peak = float(max(speech.max(initial=0), -speech.min(initial=0)))
+    peak = float(np.abs(speech).max(initial=0))
     if peak < 1e-4:
         return ["is silent"]
     found = []
-    if _clipped(speech, 0.998 * peak) > CLIPPED:
+    top = np.abs(speech) >= 0.998 * peak
+    runs = top[2:] & top[1:-1] & top[:-2]
+    if len(runs) and float(runs.mean()) > CLIPPED:
         found.append("is clipped: its loudest samples are cut off; record it at a lower level")
     size = SAMPLE_RATE // 20
-    parts = speech[: len(speech) // size * size].reshape(-1, size)
+    parts = np.asarray(speech[: len(speech) // size * size], np.float64).reshape(-1, size)
     if len(parts) < 10:
         return found
-    powers = [
-        np.square(some - some.mean(1, keepdims=True)).mean(1)
-        for some in (np.asarray(parts[first : first + 1000], np.float64) for first in range(0, len(parts), 1000))
-    ]
-    levels = 10 * np.log10(np.concatenate(powers) + 1e-12)
+    levels = 10 * np.log10(np.square(parts - parts.mean(1, keepdims=True)).mean(1) + 1e-12)
     soft = np.argsort(levels)[: max(4, len(parts) // 20)]
     apart = float(np.percentile(levels, 80) - levels[soft].mean())
     if apart < NOISY:
-        power = (
-            np.square(np.abs(np.fft.rfft(parts[soft].astype(np.float64) * np.hanning(size), axis=1)))[:, 4:-8].mean(0)
-            + 1e-12
-        )
+        power = np.square(np.abs(np.fft.rfft(parts[soft] * np.hanning(size), axis=1)))[:, 4:-8].mean(0) + 1e-12
         flatness = float(np.exp(np.log(power).mean()) / power.mean())
         what = "hiss or other noise" if flatness > TONAL else "music, hum or another steady sound"
         if apart < 6:
@@ -496,15 +490,6 @@ def speech_problems(speech: Wave) -> list[str]:
         else:
             found.append(f"has {what} {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
     return found
-
-
-def _clipped(speech: Wave, level: float) -> float:
-    """The share of samples at which three in a row reach a level; by the minute, since speech may last hours."""
-    runs, piece = 0, 60 * SAMPLE_RATE
-    for first in range(0, len(speech), piece):
-        top = np.abs(speech[first : first + piece + 2]) >= level
-        runs += int((top[2:] & top[1:-1] & top[:-2]).sum())
-    return runs / max(1, len(speech) - 2)
 
 
 class MouthAtRest:

@@ -10,7 +10,7 @@ from facediff.study.answers import FORMAT, LONGEST_COMMENT
 from facediff.study.definition import Study
 from facediff.study.texts import page_texts
 from facediff.utils.files import atomic
-from facediff.utils.pages import fill, hash_source, script_data
+from facediff.utils.html_pages import fill, hash_source, script_data
 
 PAGE = "index.html"
 

@@ -1,9 +1,9 @@
-"""From phonemes of any language to the mouth: what each sound asks of the face, and how sounds run into one another.
+"""From phonemes of any language to the mouth: the targets of each sound, and the blending of neighbours.
 
 Sounds are described by features of the International Phonetic Alphabet (place and manner of consonants; height,
 backness and rounding of vowels), and the targets of the rig follow from the features, so that a language needs no table
 of its own. Neighbouring sounds blend by overlapping dominance functions (Cohen and Massaro, "Modeling coarticulation in
-synthetic visual speech", 1993); for p, b and m the lips meet whatever the neighbours ask for.
+synthetic visual speech", 1993); for p, b and m the lips meet next to any neighbour.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _CONSONANT_OF = {symbol: kind for kind, symbols in _CONSONANTS.items() for symbo
 
 @dataclass(frozen=True)
 class Articulation:
-    """What a sound asks of the face.
+    """The targets of a sound in the face.
 
     Attributes:
         targets: weights of the rig's shapes aimed at; shapes with a left and a right side are named without one.
@@ -66,7 +66,7 @@ class Articulation:
             the shape of the sounds next to them.
         reach: how far its influence spreads in time, as a factor.
         closes: whether the lips meet.
-        firm: shapes on which it dominates fully, whatever its strength.
+        firm: shapes on which it dominates fully at any strength.
     """
 
     targets: dict[str, float]
@@ -123,14 +123,14 @@ _PLACES: dict[str, Articulation] = {
     "labial-velar": Articulation({"jawOpen": 0.05, "mouthPucker": 0.95, "mouthFunnel": 0.12}, 1.2, 1.1),
     "labial-palatal": Articulation({"jawOpen": 0.05, "mouthPucker": 0.85, "mouthFunnel": 0.12}, 1.2, 1.1),
 }
-# What a manner changes on a place.
+# Changes of a place by a manner.
 _SIBILANT = {"jawOpen": 0.035, "mouthLowerDown": 0.4, "mouthUpperUp": 0.2}
 _RHOTIC = {"mouthFunnel": 0.3, "mouthPucker": 0.28}
 
 
 @lru_cache(maxsize=512)
 def articulations(ipa: str) -> tuple[Articulation, ...]:
-    """What a phoneme asks for, in order: a diphthong or an affricate has several parts, a pause is :data:`PAUSE`.
+    """The targets of a phoneme, in order: a diphthong or an affricate has several parts, a pause is :data:`PAUSE`.
 
     Length and stress marks are left out, labialisation (ʷ) rounds and palatalisation (ʲ) spreads; a symbol that is
     not in the chart stands for a sound that is not seen.
@@ -154,17 +154,17 @@ def articulations(ipa: str) -> tuple[Articulation, ...]:
     return tuple(parts)
 
 
-def _consonant(place: str, manner: str) -> Articulation:
-    sound = _PLACES[place]
+def _consonant(location: str, manner: str) -> Articulation:
+    sound = _PLACES[location]
     if manner == "sibilant":
         sound = replace(
             sound, targets={**sound.targets, **_SIBILANT, "tongueUp": 0.3}, strength=max(0.9, sound.strength)
         )
     elif manner == "rhotic":
         sound = replace(sound, targets={**sound.targets, **_RHOTIC}, reach=1.1)
-    elif place == "bilabial" and manner == "stop":  # air builds up behind the lips
+    elif location == "bilabial" and manner == "stop":  # air builds up behind the lips
         sound = replace(sound, targets={**sound.targets, "mouthPress": 0.55, "cheekPuff": 0.12})
-    elif place == "bilabial" and manner == "fricative":
+    elif location == "bilabial" and manner == "fricative":
         sound = replace(sound, closes=False)
     elif manner == "lateral":
         sound = replace(sound, targets={**sound.targets, "jawOpen": 0.13})

@@ -113,7 +113,7 @@ DRAWN = "X"
 """How names of drawn speakers start: ``X01``, ``X02`` …"""
 MOST_DRAWN = 9999
 KEPT_OUT = ("espeak:en-us+f5", "espeak:en-gb-x-rp+f1", "espeak:en-us+m1", "espeak:en-gb-scotland+m6", "espeak:en+m8")
-"""espeak-ng's voices that no speaker is trained with: those of the unseen speakers and one of test C."""
+"""espeak-ng's voices outside the training data: of the unseen speakers and one of test C."""
 KEPT_OUT_PEOPLE = ("flite:slt", "festival:cmu_us_slt_arctic_hts")
 """Voices of people that no speaker is trained with, of one woman: the first speaks in test C."""
 _LANGUAGES = ("en-us", "en-gb-x-rp", "en-gb-scotland", "en")
@@ -138,7 +138,7 @@ def _drawn(number: int, people: tuple[str, ...]) -> CastMember:
     seen six, a fifth wider; those who are only tested have no part in it.
     """
     random = np.random.default_rng([number, 2])
-    seen = [CAST[name] for name in SEEN]
+    members = [CAST[name] for name in SEEN]
     sex = float(random.choice([-1.0, 1.0]) * random.uniform(0.4, 1.0))
     details = {item.name: float(np.clip(random.normal(0.0, 0.45), -1.0, 1.0)) for item in fields(Face)}
     face = Face(**{**details, "sex": sex})
@@ -152,13 +152,13 @@ def _drawn(number: int, people: tuple[str, ...]) -> CastMember:
     )
     habits = {}
     for item in fields(SpeakingHabits):
-        values = [getattr(member.habits, item.name) for member in seen]
+        values = [getattr(member.habits, item.name) for member in members]
         wider = 0.1 * (max(values) - min(values))
         value = float(random.uniform(min(values) - wider, max(values) + wider))
         habits[item.name] = value if min(values) < 0 else max(0.0, value)
     letter = "f" if sex < 0 else "m"
-    own = [f"espeak:{language}+{kind}" for language in _LANGUAGES for kind in _VARIANTS if kind.startswith(letter)]
-    espeak = str(random.choice([voice for voice in own if voice not in KEPT_OUT]))
+    voices = [f"espeak:{language}+{kind}" for language in _LANGUAGES for kind in _VARIANTS if kind.startswith(letter)]
+    espeak = str(random.choice([voice for voice in voices if voice not in KEPT_OUT]))
     voice = people[(number // 2) % len(people)] if people and number % 2 else espeak
     if people and people[0].startswith("aligned:"):  # recorded people are many, and each of them is one speaker
         voice = people[(number - 1) % len(people)]

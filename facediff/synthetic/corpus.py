@@ -26,7 +26,7 @@ from facediff.synthetic.head.mask import N_MASK_VERTICES, build_mask
 from facediff.synthetic.head.parts import AROUND_EYE, N_HEAD_VERTICES, build_head
 from facediff.synthetic.head.people import Complexion, coloured, dressed
 from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
-from facediff.synthetic.performance import MOODS, FaceMotion, perform
+from facediff.synthetic.performance import MOODS, FaceMotion, synthesise_motion
 from facediff.synthetic.prosody import analyse
 from facediff.synthetic.recordings import ALIGNED, recordings_of
 from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, WORDS, turn
@@ -56,10 +56,10 @@ class PerformedClip:
 
     Attributes:
         identity: who speaks.
-        split: ``train``, ``val``, ``test_a``, ``test_b``, ``test_c``, or ``references`` for those of unseen speakers
-            that belong to no split.
+        split: ``train``, ``val``, ``test_a``, ``test_b``, ``test_c``, or ``references`` for clips of unseen speakers
+            in no split.
         number: of the sentence in its list, from 1.
-        text: what is said.
+        text: words of the clip.
         mood: a name in :data:`facediff.synthetic.performance.MOODS`.
         voice: what speaks, where it is not the speaker's own voice.
     """
@@ -73,7 +73,7 @@ class PerformedClip:
 
     @property
     def sentence(self) -> str:
-        """Name of the sentence, such as ``t07``: training and reference sentences are e, those of test C c."""
+        """Name of the sentence, such as ``t07``: e for training and references, c for test C."""
         letter = {"val": "v", "test_a": "t", "test_b": "t", "test_c": "c"}.get(self.split, "e")
         return f"{letter}{self.number:02d}"
 
@@ -87,30 +87,33 @@ def performed_clips(drawn: int = 0, people: Sequence[str] = ()) -> tuple[Perform
     """All clips, speaker by speaker; moods take turns, so that every speaker has each of them equally often.
 
     Every speaker says other sentences in training, so that no sentence can be known by heart. On test A and B all
-    speakers have :data:`TEST` sentences that nobody is trained on; on test C the voices are new instead of the faces.
+    speakers have :data:`TEST` sentences outside the training data; on test C the voices are new instead of the faces.
     """
     plan: list[tuple[str, str, list[tuple[int, str]], str]] = []
-    for place, identity in enumerate(SEEN):
-        plan.append((identity, "train", turn(TRAIN, -6 * place, TRAIN_EACH), ""))
-        plan.append((identity, "val", turn(VALIDATION, place, 3), ""))
-        plan.append((identity, "test_a", turn(TEST, 3 * place, TEST_EACH), ""))
-    for place, identity in enumerate(UNSEEN):
-        plan.append((identity, "references", turn(TRAIN, 17 * place, REFERENCES_EACH), ""))
-        plan.append((identity, "test_b", turn(TEST, 4 * place + 1, TEST_EACH), ""))
+    for index, identity in enumerate(SEEN):
+        plan.append((identity, "train", turn(TRAIN, -6 * index, TRAIN_EACH), ""))
+        plan.append((identity, "val", turn(VALIDATION, index, 3), ""))
+        plan.append((identity, "test_a", turn(TEST, 3 * index, TEST_EACH), ""))
+    for index, identity in enumerate(UNSEEN):
+        plan.append((identity, "references", turn(TRAIN, 17 * index, REFERENCES_EACH), ""))
+        plan.append((identity, "test_b", turn(TEST, 4 * index + 1, TEST_EACH), ""))
     for identity, voice in zip(SEEN, _voices_of_test_c(), strict=False):
         texts = turn(GERMAN if voice.startswith("espeak:de") else TEST[-6:], 0, TEST_C_EACH)
         plan.append((identity, "test_c", texts, voice))
     moods = tuple(MOODS)
-    for place, name in enumerate(drawn_names(drawn)):
+    for index, name in enumerate(drawn_names(drawn)):
         voice = member_of(name, people).voice
-        if voice.startswith(f"{ALIGNED}:"):  # who is recorded says what was recorded
+        if voice.startswith(f"{ALIGNED}:"):  # recorded speakers say the recorded sentences
             recordings = recordings_of(voice.partition(":")[2], REFERENCES_EACH)
-            plan += [(name, "train", [(number, said.text)], said.voice) for number, said in enumerate(recordings, 1)]
+            plan += [
+                (name, "train", [(number, recording.text)], recording.voice)
+                for number, recording in enumerate(recordings, 1)
+            ]
         else:
-            plan.append((name, "train", turn(TRAIN, 5 * place, 24), ""))
+            plan.append((name, "train", turn(TRAIN, 5 * index, 24), ""))
     return tuple(
-        PerformedClip(identity, split, number, text, moods[(number + place) % len(moods)], voice)
-        for place, (identity, split, texts, voice) in enumerate(plan)
+        PerformedClip(identity, split, number, text, moods[(number + index) % len(moods)], voice)
+        for index, (identity, split, texts, voice) in enumerate(plan)
         for number, text in texts
     )
 
@@ -124,21 +127,21 @@ def mask_clips() -> tuple[PerformedClip, ...]:
     plan += [(name, "test_b", range(27, 32)) for name in MASK_UNSEEN]
     moods = tuple(MOODS)
     return tuple(
-        PerformedClip(identity, split, number + 1, SENTENCES[number], moods[(number + place) % len(moods)])
-        for place, (identity, split, numbers) in enumerate(plan)
+        PerformedClip(identity, split, number + 1, SENTENCES[number], moods[(number + index) % len(moods)])
+        for index, (identity, split, numbers) in enumerate(plan)
         for number in numbers
     )
 
 
 @dataclass(frozen=True)
-class Production:
+class CorpusVariant:
     """What differs between the corpora that are made here.
 
     Attributes:
         corpus: name in ``manifest.json``.
         mesh_file: file with the faces.
         frame_rate: motion frames a second.
-        mask: whether the motion is that of the mask instead of the whole head.
+        mask: whether the motion is of the mask instead of the whole head.
     """
 
     corpus: str = CORPUS
@@ -155,14 +158,14 @@ class Production:
         """All clips."""
         return mask_clips() if self.mask else performed_clips(drawn, people)
 
-    def carry(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Values (V, …) of the head's vertices at those of this corpus's mesh."""
+    def transfer(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Values (V, …) of the head's vertices at the vertices of this corpus's mesh."""
         precise = np.asarray(values, np.float64)
-        return build_mask().carry(precise) if self.mask else precise
+        return build_mask().transfer(precise) if self.mask else precise
 
     def colours(self, colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Colours (V, 3) of the head at this corpus's mesh."""
-        return np.rint(self.carry(colours.astype(np.float64))).astype(np.uint8)
+        return np.rint(self.transfer(colours.astype(np.float64))).astype(np.uint8)
 
     def vertices(self, index: NDArray[np.int64], *, region: bool = False) -> NDArray[np.int64]:
         """Vertices of this corpus's mesh at vertices of the head; those between them too if it is a region."""
@@ -173,14 +176,14 @@ class Production:
     def rig(self, identity: str) -> NDArray[np.float32]:
         """A speaker's face at rest and the displacements of :data:`SHAPES`, in metres, (55, V, 3)."""
         rig = rig_of(identity)
-        return self.carry(rig.transpose(1, 0, 2)).transpose(1, 0, 2).astype(np.float32) if self.mask else rig
+        return self.transfer(rig.transpose(1, 0, 2)).transpose(1, 0, 2).astype(np.float32) if self.mask else rig
 
 
-PUPPET = Production()
+PUPPET = CorpusVariant()
 MASK_SEEN = tuple(f"{DRAWN}{number}" for number in range(5001, 5009))
 MASK_UNSEEN = tuple(f"{DRAWN}{number}" for number in range(5009, 5013))
 """Speakers of the second corpus: drawn ones that the first does not have."""
-MASK = Production(f"{CORPUS}_mask", "MASK.ply", 30, mask=True)
+MASK = CorpusVariant(f"{CORPUS}_mask", "MASK.ply", 30, mask=True)
 
 
 def _voices_of_test_c() -> tuple[str, ...]:
@@ -207,40 +210,40 @@ def generate(
     scheduler: str | None = "",
     progress: bool = True,
     only: Sequence[str] | None = None,
-    production: Production = PUPPET,
+    variant: CorpusVariant = PUPPET,
 ) -> None:
     """Write the corpus, unless the folder holds it already; it appears whole or not at all.
 
     Args:
         root: the folder to make.
-        seed: seed of what is left to chance; the same seed gives the same bytes.
+        seed: random seed; the same seed gives the same bytes.
         drawn: how many drawn speakers say training sentences, besides the cast of ten.
         people: voices of people that every second drawn speaker speaks with; see :func:`people_voices`.
         workers: how many workers share the work; by default one, or all of a cluster.
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
         only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
-        production: the corpus itself, or the second one with the mask.
+        variant: the corpus itself, or the second one with the mask.
     """
-    facts = _facts(seed, drawn, people, production)
+    facts = _facts(seed, drawn, people, variant)
     if only is None and _is_complete(root, facts):
         return
-    _refuse_foreign(root, production.corpus)
-    every = production.clips(drawn, people)
+    _refuse_foreign(root, variant.corpus)
+    every = variant.clips(drawn, people)
     clips = [clip for clip in every if only is None or clip.name in only]
     if unknown := {*(only or ())} - {clip.name for clip in clips}:
         raise FaceDiffError(f"the built-in corpus has no clip {min(unknown)!r}; clips are named like {every[0].name!r}")
     with atomic_folder(root, replace=True) as folder:
-        _write_common(folder, clips, people, production)
-        work = partial(_write_clip, folder, seed=seed, people=tuple(people), production=production)
-        places = {
+        _write_common(folder, clips, people, variant)
+        work = partial(_write_clip, folder, seed=seed, people=tuple(people), variant=variant)
+        options = {
             "workers": workers or (None if is_cluster(scheduler) else 1),
             "scheduler": scheduler,
             "writes": folder,
         }
-        frames = sum(do_all(work, clips, **places, progress="Puppet corpus" if progress else ""))
-        counts = {"subjects": len(production.speakers) + drawn, "vertices": vertex_count(production), "frames": frames}
-        more = {"whole": only is None, "clips": len(clips), **counts, "frame_rate": production.frame_rate}
+        frames = sum(do_all(work, clips, **options, progress="Puppet corpus" if progress else ""))
+        counts = {"subjects": len(variant.speakers) + drawn, "vertices": vertex_count(variant), "frames": frames}
+        more = {"whole": only is None, "clips": len(clips), **counts, "frame_rate": variant.frame_rate}
         write_json(folder / MANIFEST, {**facts, **more, "files": describe_files(folder)})
 
 
@@ -252,9 +255,9 @@ def _is_complete(root: Path, facts: dict[str, object]) -> bool:
     return same and isinstance(files, dict) and same_sizes(Path(root), files)
 
 
-def _facts(seed: int, drawn: int, people: Sequence[str], production: Production) -> dict[str, object]:
+def _facts(seed: int, drawn: int, people: Sequence[str], variant: CorpusVariant) -> dict[str, object]:
     # Without what test C is spoken with: a folder stays whole where flite is installed later, or is missing.
-    facts = {"corpus": production.corpus, "format": 1, "generator": GENERATOR, "seed": seed, "drawn": drawn}
+    facts = {"corpus": variant.corpus, "format": 1, "generator": GENERATOR, "seed": seed, "drawn": drawn}
     return {**facts, "people": list(people)}
 
 
@@ -281,9 +284,9 @@ def rig_of(identity: str) -> NDArray[np.float32]:
     return rig
 
 
-def vertex_count(production: Production = PUPPET) -> int:
+def vertex_count(variant: CorpusVariant = PUPPET) -> int:
     """Vertices of a corpus's mesh."""
-    return N_MASK_VERTICES if production.mask else N_HEAD_VERTICES
+    return N_MASK_VERTICES if variant.mask else N_HEAD_VERTICES
 
 
 def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] = ()) -> NDArray[np.float32]:
@@ -310,39 +313,42 @@ def region_vertices() -> dict[str, NDArray[np.int64]]:
 
 
 def speak_clip(clip: PerformedClip, people: Sequence[str] = ()) -> Utterance:
-    """What a clip sounds like: the speaker's voice, or the clip's own, in the clip's mood, with quiet at both ends.
+    """The sound of a clip: the speaker's voice, or the clip's own, in the clip's mood, with quiet at both ends.
 
     The waveform lasts a whole number of frames at 25 a second.
     """
     member, mood = member_of(clip.identity, people), MOODS[clip.mood]
     delivery = Delivery(member.rate * mood.rate, member.pitch + mood.pitch, member.pitch_range * mood.pitch_range)
-    spoken = open_voice(clip.voice or member.voice).speak(clip.text, delivery)
-    speech = spoken.samples * (_PEAK / max(float(np.abs(spoken.samples).max()), 1e-6))
+    utterance = open_voice(clip.voice or member.voice).speak(clip.text, delivery)
+    speech = utterance.samples * (_PEAK / max(float(np.abs(utterance.samples).max()), 1e-6))
     speech = np.clip(coloured_speech(speech, mood.loudness, mood.brightness), -1.0, 1.0)
     before, frame = round(_QUIET_BEFORE * SAMPLE_RATE), SAMPLE_RATE // FRAME_RATE
     frames = round((before + len(speech) + round(_QUIET_AFTER * SAMPLE_RATE)) / frame)
     samples = np.zeros(max(frames * frame, before + len(speech)), dtype=np.float32)
     samples[before : before + len(speech)] = speech
-    return Utterance(samples[: frames * frame], _in_quiet(spoken.phonemes, before / SAMPLE_RATE, frames / FRAME_RATE))
+    phonemes = _in_quiet(utterance.phonemes, before / SAMPLE_RATE, frames / FRAME_RATE)
+    return Utterance(samples[: frames * frame], phonemes)
 
 
 def perform_clip(
-    clip: PerformedClip, spoken: Utterance, seed: int = 0, frame_rate: float = FRAME_RATE
+    clip: PerformedClip, speech: Utterance, seed: int = 0, frame_rate: float = FRAME_RATE
 ) -> tuple[FaceMotion, FaceMotion]:
     """The motion of a clip, and another that its speaker could have made with the same speech.
 
-    Of several performances of a test sentence the one is taken whose upper face is of middle liveliness, so that the
-    truth of a few sentences is typical of all; the other is the first of those that are left.
+    Of several performances of a test sentence the one with the median liveliness of the upper face is taken, so that
+    the truth of a few sentences is typical of all; the other is the first of those that are left.
     """
-    member, sounds = member_of(clip.identity), speech_sounds(spoken.phonemes)
-    contours = analyse(spoken.samples, SAMPLE_RATE)
-    frames = round(len(spoken.samples) / SAMPLE_RATE * frame_rate)
+    member, sounds = member_of(clip.identity), speech_sounds(speech.phonemes)
+    contours = analyse(speech.samples, SAMPLE_RATE)
+    frames = round(len(speech.samples) / SAMPLE_RATE * frame_rate)
     everybody = list(CAST)
-    drawn = len(everybody) - 1 + int(clip.identity.removeprefix(DRAWN)) if clip.identity not in CAST else 0
-    key = [seed, drawn or everybody.index(clip.identity), *map(ord, clip.sentence)]
+    invented = len(everybody) - 1 + int(clip.identity.removeprefix(DRAWN)) if clip.identity not in CAST else 0
+    key = [seed, invented or everybody.index(clip.identity), *map(ord, clip.sentence)]
     draws = _DRAWS if clip.split.startswith("test") else 1
     performances = [
-        perform(sounds, contours, frames, frame_rate, member.habits, clip.mood, np.random.default_rng([*key, draw]))
+        synthesise_motion(
+            sounds, contours, frames, frame_rate, member.habits, clip.mood, np.random.default_rng([*key, draw])
+        )
         for draw in range(draws)
     ]
     if draws == 1:
@@ -353,7 +359,7 @@ def perform_clip(
     return performances[middle], performances[0 if middle else 1]
 
 
-def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence[str], production: Production) -> None:
+def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence[str], variant: CorpusVariant) -> None:
     """Write everything that is not a clip."""
     for name in (
         "wav",
@@ -370,23 +376,23 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
     mesh = build_head()
     templates = {}
     for identity in dict.fromkeys(clip.identity for clip in clips):
-        rig = production.rig(identity)
+        rig = variant.rig(identity)
         np.save(folder / "rigs" / f"{identity}.npy", rig)
         templates[identity] = rig[0].astype(np.float64)
     with (folder / "templates.pkl").open("wb") as stream:
         pickle.dump(templates, stream, protocol=2)
     complexions: dict[str, Any] = {
-        name: production.colours(coloured(mesh, member_of(name, people).complexion)) for name in templates
+        name: variant.colours(coloured(mesh, member_of(name, people).complexion)) for name in templates
     }
     np.savez(folder / "colours.npz", **complexions)
-    mean = production.carry(np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0)
-    faces = build_mask().faces if production.mask else mesh.faces
-    _write_ply(folder / production.mesh_file, mean, faces, production.colours(coloured(mesh, Complexion())))
+    mean = variant.transfer(np.mean([CAST[name].face(mesh.vertices) for name in SEEN], axis=0) / 1000.0)
+    faces = build_mask().faces if variant.mask else mesh.faces
+    _write_ply(folder / variant.mesh_file, mean, faces, variant.colours(coloured(mesh, Complexion())))
     for name, index in region_vertices().items():
-        own = production.vertices(index, region=True)
-        (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, own.tolist())) + "\n")
+        vertices = variant.vertices(index, region=True)
+        (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, vertices.tolist())) + "\n")
     for file, sides in (("inner_lip_pairs.txt", lip_pairs(mesh)), ("eyelid_pairs.txt", eyelid_pairs(mesh))):
-        pairs = zip(*(production.vertices(side).tolist() for side in sides), strict=True)
+        pairs = zip(*(variant.vertices(side).tolist() for side in sides), strict=True)
         (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
     write_table(folder / "shapes.csv", [["shape"], *([name] for name in SHAPES)])
     table = [["clip", "subject", "sentence", "split", "mood", "voice", "text"]]
@@ -396,21 +402,21 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
     write_table(folder / "clips.csv", table)
 
 
-def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[str], production: Production) -> int:
+def _write_clip(folder: Path, clip: PerformedClip, seed: int, people: Sequence[str], variant: CorpusVariant) -> int:
     """Write sound, motion and phonemes of a clip and return its number of frames."""
-    spoken = speak_clip(clip, people)
-    performance, another = perform_clip(clip, spoken, seed, production.frame_rate)
-    whole = np.rint(spoken.samples * 32767.0).astype(np.int16)
-    write_wav(folder / "wav" / f"{clip.name}.wav", whole, SAMPLE_RATE)
+    speech = speak_clip(clip, people)
+    performance, another = perform_clip(clip, speech, seed, variant.frame_rate)
+    samples = np.rint(speech.samples * 32767.0).astype(np.int16)
+    write_wav(folder / "wav" / f"{clip.name}.wav", samples, SAMPLE_RATE)
     for name, track in (("weights", performance.weights), ("gaze", performance.gaze), ("head", performance.head)):
         np.save(folder / f"{name}_npy" / f"{clip.name}.npy", track.astype(np.float32))
-    if clip.split.startswith("test") and not production.mask:  # those of the mask would take a gigabyte
+    if clip.split.startswith("test") and not variant.mask:  # those of the mask would take a gigabyte
         rig = rig_of(clip.identity)
         vertices = rig[0] + np.einsum("tk,kvc->tvc", performance.weights.astype(np.float32), rig[1:])
         np.save(folder / "vertices_npy" / f"{clip.name}.npy", vertices.reshape(len(vertices), -1))
     if clip.split.startswith("test"):
         np.save(folder / "another_weights_npy" / f"{clip.name}.npy", another.weights.astype(np.float32))
-    write_table(folder / "phonemes" / f"{clip.name}.csv", [["start", "end", "ipa"], *map(_row, spoken.phonemes)])
+    write_table(folder / "phonemes" / f"{clip.name}.csv", [["start", "end", "ipa"], *map(_row, speech.phonemes)])
     return len(performance.weights)
 
 

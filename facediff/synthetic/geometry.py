@@ -11,12 +11,12 @@ Array = NDArray[np.float64]
 
 
 def through(knots: ArrayLike, values: ArrayLike, at: ArrayLike) -> Array:
-    """Interpolate with cubic Hermite pieces whose slopes never overshoot (Fritsch and Carlson, 1980).
+    """Interpolate with cubic Hermite pieces with slopes that never overshoot (Fritsch and Carlson, 1980).
 
     Knots (n,) rise; ``at`` has any shape, and outside the knots the end values hold.
     """
     x, y = np.asarray(knots, dtype=np.float64), np.asarray(values, dtype=np.float64)
-    places = np.clip(np.asarray(at, dtype=np.float64), x[0], x[-1])
+    positions = np.clip(np.asarray(at, dtype=np.float64), x[0], x[-1])
     step = np.diff(x)
     slope = np.diff(y) / step
     tangent = np.zeros_like(y)
@@ -27,8 +27,8 @@ def through(knots: ArrayLike, values: ArrayLike, at: ArrayLike) -> Array:
     harmonic = (weight_before + weight_after) / (weight_before / safe_before + weight_after / safe_after)
     tangent[1:-1] = np.where(same_way, harmonic, 0.0)
     tangent[0], tangent[-1] = slope[0], slope[-1]
-    piece = np.clip(np.searchsorted(x, places, side="right") - 1, 0, x.size - 2)
-    t = (places - x[piece]) / step[piece]
+    piece = np.clip(np.searchsorted(x, positions, side="right") - 1, 0, x.size - 2)
+    t = (positions - x[piece]) / step[piece]
     return np.asarray(
         (1 + 2 * t) * (1 - t) ** 2 * y[piece]
         + t * (1 - t) ** 2 * step[piece] * tangent[piece]
@@ -53,8 +53,8 @@ def spline(knots: ArrayLike, values: ArrayLike) -> Callable[[ArrayLike], Array]:
         right[knot] = 6 * (slope[knot] - slope[knot - 1])
     bend = np.linalg.solve(system, right)
 
-    def at(places: ArrayLike) -> Array:
-        inside = np.clip(np.asarray(places, dtype=np.float64), x[0], x[-1])
+    def at(positions: ArrayLike) -> Array:
+        inside = np.clip(np.asarray(positions, dtype=np.float64), x[0], x[-1])
         piece = np.clip(np.searchsorted(x, inside, side="right") - 1, 0, x.size - 2)
         width, before = step[piece][..., None], (inside - x[piece])[..., None]
         after = width - before

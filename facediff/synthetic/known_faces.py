@@ -46,7 +46,7 @@ class KnownFace:
 
 
 def known_face(template: NDArray[np.floating], faces: NDArray[np.integer] | None) -> KnownFace | None:
-    """What is known of a face (V, 3) in metres with triangles (F, 3); None if it is not the built-in head."""
+    """The speaker of a face (V, 3) in metres with triangles (F, 3); None if it is not the built-in head."""
     if faces is None or not is_built_in(len(template), faces):
         return None
     # Templates pass through float32, and through files that round them, hence a distance instead of equality.
@@ -102,7 +102,7 @@ def built_in_shapes(speaker: str | None = None) -> tuple[Array, Index, dict[str,
 
 
 def built_in_rig(speaker: str | None = None) -> LinearRig:
-    """The rig of a built-in head; the argument is that of :func:`built_in_shapes`."""
+    """The rig of a built-in head; the argument is as for :func:`built_in_shapes`."""
     rest, faces, shapes = built_in_shapes(speaker)
     deltas = np.stack([vertices - rest for vertices in shapes.values()])
     # The 2 is the edition, and part of the identity that files hold.
@@ -115,8 +115,6 @@ def write_puppet_shapes(folder: Path, speaker: str | None = None) -> list[str]:
     Returns:
         the names of the shapes.
     """
-    if folder.exists():
-        raise FaceDiffError(f"{folder}: exists already; choose a new folder")
     neutral, faces, shapes = built_in_shapes(speaker)
     triangles = "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1)
     with atomic_folder(folder) as temporary:

@@ -26,7 +26,7 @@ _FAR_AWAY = 12.0  # Degrees of a glance above which lids blink along (Evinger an
 
 @dataclass(frozen=True)
 class SpeakingHabits:
-    """How a person speaks and moves, whatever is said.
+    """How a person speaks and moves, independently of the words.
 
     Attributes:
         jaw, rounding, spreading, lips: gains of what speech moves.
@@ -70,7 +70,7 @@ class SpeakingHabits:
 
 @dataclass(frozen=True)
 class MoodEffect:
-    """What a mood does to every speaker, to the face and to the voice.
+    """The effect of a mood on every speaker's face and voice.
 
     Attributes:
         articulation: gain of large shapes of the mouth.
@@ -132,7 +132,7 @@ class FaceMotion:
     head: Array
 
 
-def perform(
+def synthesise_motion(
     sounds: Sequence[SpeechSound],
     prosody: ProsodyContours,
     frames: int,
@@ -168,7 +168,7 @@ def _at(middles: Array, times: Array, tracks: Array) -> Array:
 def _mouth(
     sounds: Sequence[SpeechSound], times: Array, habits: SpeakingHabits, effect: MoodEffect, random: np.random.Generator
 ) -> dict[str, Array]:
-    """What follows the phonemes; shapes with two sides are still one."""
+    """The mouth, which follows the phonemes; shapes with two sides are still one."""
     weights = blend(sounds, times + habits.lead, spread=habits.slack)
     wander = 1.0 + 0.03 * drift(times, random)
     tracks: dict[str, Array] = {}
@@ -201,25 +201,25 @@ def _gaze(times: Array, habits: SpeakingHabits, random: np.random.Generator) -> 
     """
     gaze = np.zeros((len(times), 2))
     glances: list[tuple[float, float]] = []
-    target, away, now = np.zeros(2), False, float(times[0])
-    while now < times[-1]:
+    target, away, time = np.zeros(2), False, float(times[0])
+    while time < times[-1]:
         mean = 2.5 * habits.gaze_away / 0.35 * 0.4 if away else 2.5 * (1.0 - habits.gaze_away) / 0.65
-        end = now + 0.25 + float(random.exponential(max(mean, 0.1)))
-        moment = now
+        end = time + 0.25 + float(random.exponential(max(mean, 0.1)))
+        moment = time
         while moment < end:  # small jumps about the place that is looked at
             size = float(random.exponential(0.6))
             turn = float(random.uniform(0.0, 2.0 * np.pi))
             _jump(gaze, times, moment, target + size * np.array([np.cos(turn), 0.6 * np.sin(turn)]))
             moment += 0.2 + float(random.exponential(0.5))
-        now, away = end, not away
-        place = np.zeros(2)
+        time, away = end, not away
+        point = np.zeros(2)
         if away:
             size = 4.0 + min(float(random.exponential(6.9)), 16.0)
             turn = float(random.choice([0.0, np.pi], p=[0.5, 0.5])) + float(random.normal(0.0, 0.5))
-            place = size * np.array([np.cos(turn), 0.7 * np.sin(turn)])
-        glances.append((now, float(np.linalg.norm(place - target))))
-        target = place
-        _jump(gaze, times, now, target)
+            point = size * np.array([np.cos(turn), 0.7 * np.sin(turn)])
+        glances.append((time, float(np.linalg.norm(point - target))))
+        target = point
+        _jump(gaze, times, time, target)
     return gaze, glances
 
 
@@ -272,10 +272,10 @@ def _blinks(
     """
     rate = habits.blinks / 60.0
     moments = [moment for moment, size in glances if size > _FAR_AWAY and random.uniform() < 0.6]
-    now = float(times[0] + random.exponential(1.0 / rate))
-    while now < times[-1]:
-        moments.append(now)
-        now += 0.6 + float(random.exponential(1.0 / rate))
+    time = float(times[0] + random.exponential(1.0 / rate))
+    while time < times[-1]:
+        moments.append(time)
+        time += 0.6 + float(random.exponential(1.0 / rate))
     shut = np.zeros_like(times)
     last = -1.0
     for moment in sorted(moments):

@@ -65,8 +65,8 @@ def _blur(values: Array, deviation: float) -> Array:
     return blurred(values, np.arange(-reach, reach + 1) * _HOP / deviation)
 
 
-def blurred(values: Array, places: NDArray[np.floating]) -> Array:
+def blurred(values: Array, offsets: NDArray[np.floating]) -> Array:
     """Values blurred with a Gaussian that is sampled at ``places``, in standard deviations; the ends are held."""
-    kernel = np.exp(-0.5 * places**2)
-    padded = np.pad(values, len(places) // 2, mode="edge")
+    kernel = np.exp(-0.5 * offsets**2)
+    padded = np.pad(values, len(offsets) // 2, mode="edge")
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")

@@ -41,7 +41,7 @@ class Aligned(Synthesiser):
         return cls(voice)
 
     def speak(self, text: str = "", delivery: Delivery = Delivery()) -> Utterance:  # noqa: ARG002, B008 - frozen
-        """The recording, whatever the text and the delivery."""
+        """The recording, for any text and delivery."""
         stem = Path(self.voice)
         stem = stem.with_suffix("") if stem.suffix.lower() in (*SOUNDS, ".textgrid") else stem
         suffixes = (*SOUNDS, *map(str.upper, SOUNDS))
@@ -68,9 +68,7 @@ class Recording:
 
 def speakers_of(folder: Path) -> tuple[str, ...]:
     """Folders of the speakers below a folder, each with at least one aligned recording; sorted."""
-    if not folder.is_dir():
-        raise FaceDiffError(f"{folder}: no such folder; expected SPEAKER/NAME.wav or .flac, each with NAME.TextGrid")
-    speakers = tuple(str(path) for path in sorted(folder.iterdir()) if path.is_dir() and _stems(path))
+    speakers = tuple(str(path) for path in sorted(folder.glob("*/")) if _stems(path))
     if not speakers:
         raise FaceDiffError(
             f"{folder}: holds no aligned recording; expected SPEAKER/NAME.wav or .flac, each with NAME.TextGrid"
@@ -78,20 +76,20 @@ def speakers_of(folder: Path) -> tuple[str, ...]:
     return speakers
 
 
-def recordings_of(speaker: str, most: int) -> list[Recording]:
+def recordings_of(speaker: str, count: int) -> list[Recording]:
     """The first recordings of a speaker's folder that last no longer than 12 s."""
-    taken = []
+    recordings = []
     for stem in _stems(Path(speaker)):
         grid = Path(f"{stem}.TextGrid")
         if phones_of(grid)[-1].end <= LONGEST:
-            words = find_tier(read_text_grid(grid), WORDS)
-            spoken = [text for _, _, text in (words or []) if text.lower() not in SILENCES]
-            taken.append(Recording(f"{ALIGNED}:{stem}", " ".join(spoken) or stem.name))
-        if len(taken) == most:
+            tier = find_tier(read_text_grid(grid), WORDS) or []
+            text = " ".join(text for _, _, text in tier if text.lower() not in SILENCES)
+            recordings.append(Recording(f"{ALIGNED}:{stem}", text or stem.name))
+        if len(recordings) == count:
             break
-    if not taken:
+    if not recordings:
         raise FaceDiffError(f"{speaker}: no recording of {LONGEST:g} s or less; cut them and align them again")
-    return taken
+    return recordings
 
 
 @lru_cache(maxsize=4096)
@@ -113,11 +111,9 @@ def phones_of(path: Path) -> tuple[SpokenPhoneme, ...]:
     # Single letters are in both alphabets: a tier is in the ARPAbet if all its phones are, and one of two letters.
     arpabet = {label for label in sounding if label.lower() in CMU_PHONES}
     is_arpabet = any(len(label) == 2 and label.isascii() for label in arpabet)
-    if is_arpabet and arpabet != sounding:
-        strange = min(sounding - arpabet)
-        raise FaceDiffError(f'{path}: its tier of phones has "{strange}", no phone of the ARPAbet; {REMEDY}')
-    if not sounding:
-        raise FaceDiffError(f"{path}: its tier of phones holds pauses only; {REMEDY}")
+    if not sounding or (is_arpabet and arpabet != sounding):
+        fault = f'has "{min(sounding - arpabet)}", no phone of the ARPAbet' if sounding else "holds pauses only"
+        raise FaceDiffError(f"{path}: its tier of phones {fault}; {REMEDY}")
     phonemes = []
     for (start, end, _), label in zip(intervals, labels, strict=True):
         ipa = "" if label.lower() in SILENCES else CMU_PHONES[label.lower()] if is_arpabet else label

@@ -1,6 +1,6 @@
 """Sentences and words of the built-in corpus, all written for it.
 
-Most sentences are rich in p, b and m, in rounded and in open vowels, since these are what the mouth shows. No sentence
+Most sentences are rich in p, b and m, in rounded and in open vowels, since the mouth shows these. No sentence
 is in two of the lists.
 """
 
@@ -118,8 +118,8 @@ GERMAN: tuple[str, ...] = (
 
 def turn(sentences: Sequence[str], first: int, count: int) -> list[tuple[int, str]]:
     """Some sentences in a row from a place on, round the end, with their numbers from 1."""
-    places = [(first + step) % len(sentences) for step in range(count)]
-    return [(place + 1, sentences[place]) for place in places]
+    indices = [(first + step) % len(sentences) for step in range(count)]
+    return [(index + 1, sentences[index]) for index in indices]
 
 
 # Chosen for this corpus, so that every English sound occurs in several places of a word; no content word is in the test

@@ -1,4 +1,4 @@
-"""Speech whose phonemes are exactly known, in several voices and languages, and the open face that models are put on.
+"""Speech with exactly known phonemes, in several voices and languages, and the open face that models are put on.
 
 The face is the built-in speaker F1's. The motion that the built-in corpus would have for the same speech is the
 reference: its mouth follows from the phonemes, the rest is one of many performances.
@@ -24,13 +24,13 @@ from facediff.synthetic.head.parts import build_head
 from facediff.synthetic.head.rig import eyelid_pairs, lip_pairs
 from facediff.synthetic.known_faces import built_in_rig
 from facediff.synthetic.sentences import GERMAN, TEST
-from facediff.synthetic.voices import installed_voices, open_voice
+from facediff.synthetic.voices import installed_voices
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic_folder
 from facediff.utils.plain_files import write_table
 
 SPEAKER = "F1"
-"""The built-in speaker whose face, delivery and habits are taken."""
+"""The built-in speaker with the face, delivery and habits that are used."""
 
 # Written for this purpose, and rich in p, b and m.
 _SPANISH = (
@@ -61,11 +61,11 @@ _MANDARIN = (
 
 @dataclass(frozen=True)
 class Language:
-    """What is spoken in a language.
+    """The sentences of a language and the voices that speak them.
 
     Attributes:
         name: in English.
-        voices: in the order in which they are taken; those of programs that are missing are left out.
+        voices: in order of preference; voices of missing programs are left out.
         sentences: in which no model of the built-in corpus was trained.
     """
 
@@ -95,7 +95,7 @@ class SpokenClip:
         name: stem of its files.
         language: a code in :data:`LANGUAGES`.
         voice: as :func:`facediff.synthetic.voices.open_voice` takes it.
-        text: what is said.
+        text: words of the clip.
         samples: (S,) at 16 kHz.
         phonemes: without gaps.
     """
@@ -126,17 +126,16 @@ def spoken_set(languages: Sequence[str], voices: int, sentences: int) -> list[Sp
     for code in languages:
         if code not in LANGUAGES:
             raise FaceDiffError(f"--languages {code}: {choices(code, LANGUAGES)}")
-        own = LANGUAGES[code]
-        usable = [voice for voice in own.voices if voice.partition(":")[0] in installed]
+        language = LANGUAGES[code]
+        usable = [voice for voice in language.voices if voice.partition(":")[0] in installed]
         if not usable:
             raise FaceDiffError(f'--languages {code}: no voice is installed; pip install "facediff[puppet]"')
-        for place, voice in enumerate(usable[:voices]):
-            open_voice(voice)
-            for number in range(min(sentences, len(own.sentences))):
-                text = own.sentences[(place * sentences + number) % len(own.sentences)]
-                stem = voice.replace(":", "_").replace("+", "_")
-                spoken = speak_clip(_performed(text, number, voice))
-                clips.append(SpokenClip(f"{stem}_{number + 1:02d}", code, voice, text, spoken.samples, spoken.phonemes))
+        for index, voice in enumerate(usable[:voices]):
+            for number in range(min(sentences, len(language.sentences))):
+                text = language.sentences[(index * sentences + number) % len(language.sentences)]
+                name = f"{voice.replace(':', '_').replace('+', '_')}_{number + 1:02d}"
+                speech = speak_clip(_performed(text, number, voice))
+                clips.append(SpokenClip(name, code, voice, text, speech.samples, speech.phonemes))
     return clips
 
 
@@ -145,15 +144,13 @@ def _performed(text: str, number: int, voice: str) -> PerformedClip:
 
 
 def write_spoken_set(clips: Sequence[SpokenClip], folder: Path) -> None:
-    """Write recordings, the times of their phonemes, and a table of what is said, for models that run elsewhere."""
-    if folder.exists():
-        raise FaceDiffError(f"{folder}: exists already; choose a new folder")
+    """Write recordings, the times of their phonemes, and a table of the sentences, for models that run elsewhere."""
     with atomic_folder(folder) as temporary:
         for name in ("wav", "phonemes"):
             (temporary / name).mkdir()
         for clip in clips:
-            whole = np.rint(clip.samples * 32767).astype(np.int16)
-            write_wav(temporary / "wav" / f"{clip.name}.wav", whole, SAMPLE_RATE)
+            samples = np.rint(clip.samples * 32767).astype(np.int16)
+            write_wav(temporary / "wav" / f"{clip.name}.wav", samples, SAMPLE_RATE)
             rows = [[f"{p.start:.4f}", f"{p.end:.4f}", p.ipa] for p in clip.phonemes]
             write_table(temporary / "phonemes" / f"{clip.name}.csv", [["start", "end", "ipa"], *rows])
         table = [[clip.name, clip.language, clip.voice, clip.text] for clip in clips]
@@ -188,7 +185,7 @@ class OpenFace:
 
 @dataclass(frozen=True, eq=False)
 class SpokenMotion:
-    """What somebody makes of a clip.
+    """A motion for a clip.
 
     Attributes:
         points: (T, P, 3) of the open face in metres; or (T, C, 1), the face's channels, where no face could be made.
@@ -205,15 +202,15 @@ def open_face() -> OpenFace:
     mesh, regions = build_head(), region_vertices()
     lips, lids = (np.stack(pairs(mesh), axis=1) for pairs in (lip_pairs, eyelid_pairs))
     points = np.unique(np.concatenate([lips.ravel(), lids.ravel(), regions["lve"], regions["fdd"]]))
-    own = [np.searchsorted(points, index) for index in (lips, lids, regions["lve"], regions["fdd"])]
-    return OpenFace(built_in_rig(SPEAKER), points, *own)
+    indices = (np.searchsorted(points, index) for index in (lips, lids, regions["lve"], regions["fdd"]))
+    return OpenFace(built_in_rig(SPEAKER), points, *indices)
 
 
 def reference(clip: SpokenClip, frame_rate: float) -> SpokenMotion:
     """How the built-in corpus performs a clip."""
     number = int(clip.name.rpartition("_")[2]) - 1
-    spoken = Utterance(clip.samples, clip.phonemes)
-    performed, _ = perform_clip(_performed(clip.text, number, clip.voice), spoken, 0, frame_rate)
+    speech = Utterance(clip.samples, clip.phonemes)
+    performed, _ = perform_clip(_performed(clip.text, number, clip.voice), speech, 0, frame_rate)
     rig = rig_of(SPEAKER)[:, open_face().points].astype(np.float64)
     # Turns of a few degrees about three axes are nearly the axis-angle of all of them; one about z leads to the right.
     turns = np.deg2rad(performed.head) * [1.0, 1.0, -1.0]

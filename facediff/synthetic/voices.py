@@ -2,7 +2,7 @@
 
 espeak-ng comes with ``pip install "facediff[puppet]"`` and speaks a hundred languages by rule. flite and Festival are
 programs of their own (packages of the same names in Debian, Ubuntu, Fedora and Homebrew); their voices are made from
-recordings of people, so that what is trained on them knows more of people's voices. All of them print when each phoneme
+recordings of people, so that models trained on them know more of people's voices. All of them print when each phoneme
 is spoken, which no recogniser has to guess. Where one is missing, its voices say how to install it.
 """
 
@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, damaged
 from facediff.registry import puppet_voice
 from facediff.speech.espeak import EspeakVoice, SpokenPhoneme, Utterance, speak
 from facediff.utils import SAMPLE_RATE
@@ -70,10 +70,9 @@ class Synthesiser(ABC):
     def open(cls, voice: str, name: str) -> Synthesiser:
         """One of the voices that are installed; ``name`` is its whole name, for errors."""
         program, installed = name.partition(":")[0], cls.voices()
-        if not installed:
-            raise FaceDiffError(f'voice "{name}": {program} is not installed; {cls.install}')
         if voice.split("+")[0] not in installed:
-            raise FaceDiffError(f'voice "{name}": {program} has no voice "{voice}"; {choices(voice, installed)}')
+            reason = f'has no voice "{voice}"; {choices(voice, installed)}' if installed else "is not installed"
+            raise FaceDiffError(f'voice "{name}": {program} {reason}{"" if installed else f"; {cls.install}"}')
         return cls(voice)
 
     @abstractmethod
@@ -83,12 +82,9 @@ class Synthesiser(ABC):
 
 def open_voice(name: str) -> Synthesiser:
     """The voice of a name such as ``flite:slt``."""
-    program, colon, voice = name.partition(":")
-    synthesiser = puppet_voice.get(program)
-    if not colon or not voice:
-        raise FaceDiffError(f'voice "{name}": names no voice; expected SYNTHESISER:VOICE, such as flite:slt')
-    opened: Synthesiser = synthesiser.open(voice, name)
-    return opened
+    program, _, voice = name.partition(":")
+    synthesiser: Synthesiser = puppet_voice.get(program).open(voice, name)
+    return synthesiser
 
 
 def in_language(voice: str, language: str) -> str:
@@ -130,39 +126,14 @@ class Espeak(Synthesiser):
 
 
 # The phones of CMU's dictionary, as flite and Festival name them, in the International Phonetic Alphabet.
-CMU_PHONES = {
-    **{"aa": "ɑ", "ae": "æ", "ah": "ʌ", "ao": "ɔ", "aw": "aʊ", "ax": "ə", "axr": "ɚ", "ay": "aɪ", "eh": "ɛ", "er": "ɝ"},
-    **{"ey": "eɪ", "ih": "ɪ", "iy": "i", "ow": "oʊ", "oy": "ɔɪ", "uh": "ʊ", "uw": "u", "el": "əl", "em": "əm"},
-    **{"en": "ən", "b": "b", "ch": "tʃ", "d": "d", "dh": "ð", "dx": "ɾ", "f": "f", "g": "ɡ", "hh": "h", "hv": "ɦ"},
-    **{
-        "jh": "dʒ",
-        "k": "k",
-        "l": "l",
-        "m": "m",
-        "n": "n",
-        "nx": "ɾ",
-        "ng": "ŋ",
-        "p": "p",
-        "q": "ʔ",
-        "r": "ɹ",
-        "s": "s",
-    },
-    **{
-        "sh": "ʃ",
-        "t": "t",
-        "th": "θ",
-        "v": "v",
-        "w": "w",
-        "y": "j",
-        "z": "z",
-        "zh": "ʒ",
-        "pau": "",
-        "h#": "",
-        "brth": "",
-    },
-}
+_CMU = """
+aa=ɑ ae=æ ah=ʌ ao=ɔ aw=aʊ ax=ə axr=ɚ ay=aɪ eh=ɛ er=ɝ ey=eɪ ih=ɪ iy=i ow=oʊ oy=ɔɪ uh=ʊ uw=u el=əl em=əm en=ən
+b=b ch=tʃ d=d dh=ð dx=ɾ f=f g=ɡ hh=h hv=ɦ jh=dʒ k=k l=l m=m n=n nx=ɾ ng=ŋ p=p q=ʔ r=ɹ s=s sh=ʃ t=t th=θ v=v
+w=w y=j z=z zh=ʒ pau= h#= brth=
+"""
+CMU_PHONES = dict(pair.split("=") for pair in _CMU.split())
 
-# Those of Festival's phone sets that are no symbols of that alphabet; figures at the end mark stress.
+# Phones of Festival's sets that are no symbols of that alphabet; figures at the end mark stress.
 _PHONES = {
     "radio": CMU_PHONES,
     "italian": {
@@ -209,21 +180,21 @@ class Flite(Synthesiser):
 class Festival(Synthesiser):
     """Festival: voices of people in several languages, one package each (festvox-…).
 
-    A voice reads English by the rules of its own language, which does no harm: what is said is what Festival says was.
+    A voice reads English by the rules of its own language, and Festival prints its phones.
     """
 
     install = "install the packages festival and festvox-kallpc16k (apt install festival festvox-kallpc16k)"
 
     @classmethod
     def voices(cls) -> list[str]:
-        """Festival's voices whose phones are known."""
+        """Festival's voices with known phones."""
         return sorted(cls._phone_sets())
 
     @staticmethod
     def _phone_sets() -> dict[str, str]:
         """The phone set of each voice."""
-        asked = "(mapcar (lambda (v) (voice.select v) (print (cons v (PhoneSet.description '(name))))) (voice.list))"
-        pairs = re.findall(r"\((\S+) \(name (\S+?)\)\)", _listed("festival", "-b", asked))
+        query = "(mapcar (lambda (v) (voice.select v) (print (cons v (PhoneSet.description '(name))))) (voice.list))"
+        pairs = re.findall(r"\((\S+) \(name (\S+?)\)\)", _listed("festival", "-b", query))
         return {voice: phones for voice, phones in pairs if phones in _PHONES}
 
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
@@ -259,16 +230,11 @@ def _printed_once(*command: str) -> str:
 
 
 def _run(command: Sequence[str]) -> str:
-    """What a synthesiser prints."""
-    try:
-        done = subprocess.run(  # noqa: S603 - a program on the path, without a shell
-            command, capture_output=True, text=True, check=False, timeout=_SECONDS
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise FaceDiffError(f"{command[0]}: {error}; try it in a terminal") from error
-    if done.returncode:
-        raise FaceDiffError(f"{command[0]}: failed ({done.stderr.strip()[-200:]}); try it in a terminal")
-    return done.stdout
+    """The output of a synthesiser."""
+    with damaged(f"{command[0]}: failed", "try it in a terminal", OSError, subprocess.SubprocessError):
+        return subprocess.run(  # noqa: S603 - a program on the path, without a shell
+            command, capture_output=True, text=True, check=True, timeout=_SECONDS
+        ).stdout
 
 
 def _utterance(
@@ -278,18 +244,16 @@ def _utterance(
     import soundfile
     import soxr
 
-    if not sound.is_file():
-        raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')
-    native, rate = soundfile.read(sound, dtype="float32")
-    samples = native if rate == SAMPLE_RATE else soxr.resample(native, rate, SAMPLE_RATE, quality="HQ")
     phonemes, start = [], 0.0
     for name, end in ends:
         if end > start:
             plain = name.rstrip(":") if name.rstrip(":") in phones else name.rstrip("01:")
             phonemes.append(SpokenPhoneme(start, end, "" if name in _PAUSES else phones.get(plain, plain)))
         start = max(start, end)
-    if not any(phoneme.ipa for phoneme in phonemes):
+    if not sound.is_file() or not any(phoneme.ipa for phoneme in phonemes):
         raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')
+    native, rate = soundfile.read(sound, dtype="float32")
+    samples = native if rate == SAMPLE_RATE else soxr.resample(native, rate, SAMPLE_RATE, quality="HQ")
     return Utterance(np.asarray(samples, dtype=np.float32), tuple(phonemes))
 
 

@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.files import atomic
-from facediff.utils.limits import brief
 
 # NumPy parses a file's header with Python's own parser, which two threads that read at the same time can break in
 # Python 3.11 (SystemError, "AST constructor recursion depth mismatch").
@@ -32,17 +31,14 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
         name: what messages call the file, e.g. the option that names it; its path if empty.
     """
     name = name or str(path)
-    try:
+    # A damaged header makes NumPy raise anything.
+    with damaged(f"{name}: not a readable NumPy array", "expected a .npy file of numbers", Exception):
         with _PARSING, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
             array = np.load(path, mmap_mode=mode, allow_pickle=False)
-    except Exception as error:  # a damaged header makes NumPy raise anything
-        raise FaceDiffError(
-            f"{name}: not a readable NumPy array ({brief(error)}); expected a .npy file of numbers"
-        ) from error
-    if not isinstance(array, np.ndarray):
-        array.close()
-        raise FaceDiffError(f"{name}: is an archive of several arrays; name it .npz")
+        if not isinstance(array, np.ndarray):
+            array.close()
+            raise ValueError("is an archive of several arrays, name it .npz")
     if kinds and (not array.size or array.dtype.kind not in kinds):
         expected = "floating-point numbers" if kinds == "f" else "numbers"
         raise FaceDiffError(f"{name}: holds {array.dtype} {array.shape}; expected {expected}")
@@ -54,7 +50,7 @@ def open_vertices(
 ) -> npt.NDArray[np.floating]:
     """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3), memory-mapped.
 
-    Any number of vertices will do if ``n_vertices`` is None; ``mode`` is that of :func:`open_array`.
+    Any number of vertices will do if ``n_vertices`` is None; ``mode`` is as for :func:`open_array`.
     """
     array = open_array(path, kinds="f", mode=mode)
     count = vertices_of(array.shape)
@@ -82,15 +78,12 @@ def read_arrays(
         name: what messages call the file; its path if empty.
         remedy: what messages advise.
     """
-    name = name or str(path)
-    try:
-        with _PARSING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
-            # Opened here, since NumPy leaves a damaged archive open.
-            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-                return {entry: archive[entry] for entry in archive.files if keys is None or entry in keys}
-    except Exception as error:  # zipfile, zlib and NumPy each have several exceptions for damaged files
-        raise FaceDiffError(f"{name}: not a readable .npz file ({brief(error)}); {remedy}") from error
+    # zipfile, zlib and NumPy each have several exceptions for damaged files.
+    with damaged(f"{name or path}: not a readable .npz file", remedy, Exception), _PARSING, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
+        # Opened here, since NumPy leaves a damaged archive open.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {entry: archive[entry] for entry in archive.files if keys is None or entry in keys}
 
 
 class ArrayStore:

@@ -1,4 +1,4 @@
-"""Batches that can be stopped and continued: a task that fails stops no other, and what is done is not done again."""
+"""Batches that can be stopped and continued: a task that fails stops no other, and no finished task is repeated."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.checksums import sha256
 from facediff.utils.files import remove_partial, short_name
 from facediff.utils.jobs import SetupError, run_tasks
+from facediff.utils.limits import quoted
 from facediff.utils.plain_files import parse_json, read_json, write_json
 from facediff.utils.workers import WorkerDied
 
@@ -25,8 +26,6 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-SHOWN = 60
-"""Characters of a setting in messages."""
 RECORDS = ".facediff-batch"
 """Hidden folder next to the outputs of a batch; it holds one small file for each output."""
 
@@ -66,8 +65,8 @@ def run_batch(
         scheduler: where the tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
         writes: folder that tasks write to.
         reads: files and folders that tasks read.
-        record: called with each task that is done, its problem and its result, in the worker, so that also what is
-            finished after Ctrl-C is recorded; picklable.
+        record: called with each task that is done, its problem and its result, in the worker, so that tasks that end
+            after Ctrl-C are recorded too; picklable.
         survive_bugs: whether an exception that is no :class:`FaceDiffError` is printed and counts as a failure of the
             task; it is raised otherwise.
         progress: title of a progress bar; none if empty.
@@ -106,7 +105,7 @@ def do_all(work: Callable[[Task], Result], tasks: Sequence[Task], **options: Any
 
 
 def begin_folder(
-    out: Path, state: str, recipe: Mapping[str, Any], command: str, finished: Mapping[str, Any] | None = None
+    out: Path, state: str, recipe: Mapping[str, Any], command: str, complete: Mapping[str, Any] | None = None
 ) -> None:
     """Begin or continue a folder, which a killed run has left; a folder of anything else is refused.
 
@@ -118,18 +117,20 @@ def begin_folder(
         state: file in it that holds the recipe while the folder is unfinished.
         recipe: all that determines the bytes of the output, plain data; a run is continued only with the same.
         command: what writes it, for messages.
-        finished: the recipe of a finished folder that lacks something.
+        complete: the recipe of a finished folder that lacks something.
     """
     recipe = parse_json(json.dumps(recipe), state)  # as the file will hold it: lists, no tuples
-    earlier = read_json(out / state) or finished
-    if earlier is None and (others := [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]):
+    earlier = read_json(out / state) or complete
+    if earlier is None and (files := [path.name for path in sorted(out.iterdir()) if not path.name.startswith(".")]):
         raise FaceDiffError(
-            f"{out}: holds other files ({', '.join(others[:3])}{' …' if len(others) > 3 else ''}) and was not begun by "
+            f"{out}: holds other files ({', '.join(files[:3])}{' …' if len(files) > 3 else ''}) and was not begun by "
             f"`{command}`; choose a new folder"
         )
     if earlier is not None:
-        changed = [name for name in {**earlier, **recipe} if earlier.get(name) != recipe.get(name)]
-        changes = [f"{name} was {_value(earlier.get(name))} and is {_value(recipe.get(name))}" for name in changed]
+        settings = {name: (earlier.get(name), recipe.get(name)) for name in {**earlier, **recipe}}
+        changes = [
+            f"{name} was {quoted(old)} and is {quoted(new)}" for name, (old, new) in settings.items() if old != new
+        ]
         if changes:
             raise FaceDiffError(
                 f"{out}: was begun with other settings ({'; '.join(changes)}); use the same, choose another folder, or "
@@ -137,12 +138,6 @@ def begin_folder(
             )
     write_json(out / state, recipe)
     remove_partial(out, recursive=True)
-
-
-def _value(value: object) -> str:
-    """A setting in words."""
-    words = " ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return words if len(words) <= SHOWN else f"{words[:SHOWN]}…"
 
 
 def _attempt(
@@ -178,7 +173,7 @@ def _is_full(error: BaseException | None) -> bool:
     return error is not None and (getattr(error, "errno", None) in NO_SPACE or _is_full(error.__cause__))
 
 
-# Is an output still current? One small file records what it was made of.
+# Is an output still current? One small file records its sources.
 
 
 @dataclass(frozen=True)
@@ -191,9 +186,6 @@ class Recipe:
     @classmethod
     def of(cls, command: Sequence[str], files: Sequence[Path]) -> Recipe:
         """Read the files."""
-        for path in files:
-            if not path.is_file():
-                raise FaceDiffError(f"{path}: no such file")
         return cls(tuple(command), {str(path): sha256(path) for path in files})
 
     def joined(self, files: Sequence[Path]) -> Recipe:

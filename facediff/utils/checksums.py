@@ -7,17 +7,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from facediff.errors import FaceDiffError
+from facediff.errors import damaged
 from facediff.utils.jobs import run_tasks
 
 
 def sha256(path: Path) -> str:
     """SHA-256 of a file's bytes, in hexadecimal."""
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror or error}); check who may read it") from error
+    with damaged(f"{path}: cannot be read", "check who may read it", OSError), path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def describe_files(

@@ -1,9 +1,9 @@
-"""Tasks on a Dask cluster, for :func:`facediff.utils.jobs.run_tasks`: the part of the client and that of the workers.
+"""Tasks on a Dask cluster, for :func:`facediff.utils.jobs.run_tasks`: its client and its workers.
 
 A worker does one task at a time, in the client's working folder, on one processor, and loads a model once. Dask's nanny
 starts a worker again that a task has killed; a task that kills several of them fails alone.
 
-Dask runs whatever its clients send. Whoever can connect to a scheduler can run programs as the user of its workers; use
+Dask runs anything that its clients send: a connection to a scheduler can run programs as the user of its workers. Use
 one that only its users reach, or TLS (``docs/cluster.md``).
 """
 
@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.files import scratch_folder
 from facediff.utils.workers import GRACE, SLURM, WorkerDied, one_thread_each
 from facediff.version import __version__
@@ -66,7 +66,7 @@ class ClusterRun:
 
 
 def fingerprint(path: str) -> int | tuple[str, ...] | None:
-    """What is at a path, by which another machine finds out whether it sees the same.
+    """The fingerprint of a path, by which another machine finds out whether it sees the same.
 
     Returns:
         a file's size, a few names out of a folder, which may get more meanwhile, or None if there is nothing.
@@ -99,15 +99,15 @@ def run_on_cluster(
     writes: Path | None = None,
     reads: Iterable[Path] = (),
 ) -> Generator[tuple[Task, Result | WorkerDied]]:
-    """Do tasks on a cluster; arguments, results and errors are those of :func:`facediff.utils.jobs.run_tasks`.
+    """Do tasks on a cluster; arguments, results and errors are as for :func:`facediff.utils.jobs.run_tasks`.
 
     Args:
         work: does a task.
-        tasks: what it is called with.
+        tasks: its arguments.
         scheduler: address of a Dask scheduler, or ``slurm`` with options.
         workers: workers that are used at a time; all if None. With SLURM, how many are asked for.
         writes: folder that tasks write to.
-        reads: what they read.
+        reads: files and folders that they read.
     """
     if not tasks:
         return
@@ -134,18 +134,18 @@ def results_of(
     run: ClusterRun,
     tasks: Sequence[Task],
     scheduler: str,
-    most: int,
+    limit: int,
 ) -> Generator[tuple[Task, Any]]:
     """Tasks with their results, as they are done; no worker gets a second task before it is free."""
     import cloudpickle
 
     refuse_unfit(client, run, scheduler)
     shared = client.submit(ClusterRun, **vars(run), pure=False)  # goes to each worker once
-    waiting, running = deque(tasks), dict[Any, tuple[Task, str]]()
-    done: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    pending, running = deque(tasks), dict[Any, tuple[Task, str]]()
+    completed: queue.SimpleQueue[Any] = queue.SimpleQueue()
     last_worker = time.monotonic()
     try:
-        while waiting or running:
+        while pending or running:
             addresses = list(client.nthreads())
             last_worker = time.monotonic() if addresses or is_slurm(scheduler) else last_worker
             if time.monotonic() - last_worker > PATIENCE:
@@ -153,21 +153,21 @@ def results_of(
                     f"--scheduler {scheduler}: has had no worker for {PATIENCE:.0f} s; start some with "
                     f"`dask worker {scheduler}`, and run the same command again"
                 )
-            busy = {address for _, address in running.values()}
-            for address in [address for address in addresses if address not in busy][: most - len(running)]:
-                if waiting:
-                    task = waiting.popleft()
+            occupied = {address for _, address in running.values()}
+            for address in [address for address in addresses if address not in occupied][: limit - len(running)]:
+                if pending:
+                    task = pending.popleft()
                     options = {"workers": [address], "allow_other_workers": True, "pure": False}
                     future = client.submit(do_task, shared, cloudpickle.dumps(task), **options)
-                    future.add_done_callback(done.put)
+                    future.add_done_callback(completed.put)
                     running[future] = task, address
             with suppress(queue.Empty):
-                future = done.get(timeout=1.0)
+                future = completed.get(timeout=1.0)
                 task, _ = running.pop(future)
                 yield task, outcome(future, scheduler)
     finally:
         if running:
-            stop(client, running, done)
+            stop(client, running, completed)
 
 
 def outcome(future: Any, scheduler: str) -> Any:  # noqa: ANN401
@@ -184,17 +184,17 @@ def outcome(future: Any, scheduler: str) -> Any:  # noqa: ANN401
     return future.result()
 
 
-def stop(client: Any, running: Mapping[Any, Any], done: queue.SimpleQueue[Any]) -> None:  # noqa: ANN401
-    """Let what is running come to its end for some seconds, then start its workers again."""
+def stop(client: Any, running: Mapping[Any, Any], completed: queue.SimpleQueue[Any]) -> None:  # noqa: ANN401
+    """Let running tasks come to their end for some seconds, then start their workers again."""
     left, end = {future.key for future in running}, time.monotonic() + GRACE
     with suppress(queue.Empty):
         while left and (seconds := end - time.monotonic()) > 0:
-            left.discard(done.get(timeout=seconds).key)
+            left.discard(completed.get(timeout=seconds).key)
     with suppress(Exception):  # a scheduler that is gone has nothing to end; workers without a nanny finish their tasks
-        busy = [address for address, keys in client.processing().items() if left & set(keys)]
+        occupied = [address for address, keys in client.processing().items() if left & set(keys)]
         client.cancel(list(running))
-        if busy:
-            client.restart_workers(busy, timeout=GRACE)
+        if occupied:
+            client.restart_workers(occupied, timeout=GRACE)
 
 
 def refuse_unfit(client: Any, run: ClusterRun, scheduler: str) -> None:  # noqa: ANN401
@@ -220,8 +220,8 @@ def search_path() -> tuple[str, ...]:
     """Folders of the user's own from which this process imports modules, such as the working folder."""
     installed = {os.path.realpath(prefix) for prefix in (sys.prefix, sys.base_prefix)}
     absolute = [os.path.realpath(entry or os.getcwd()) for entry in sys.path]
-    own = [entry for entry in absolute if not any(entry.startswith(prefix + os.sep) for prefix in installed)]
-    return tuple(dict.fromkeys(own))
+    entries = [entry for entry in absolute if not any(entry.startswith(prefix + os.sep) for prefix in installed)]
+    return tuple(dict.fromkeys(entries))
 
 
 def own_environment() -> dict[str, str]:
@@ -231,7 +231,7 @@ def own_environment() -> dict[str, str]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep Dask from logging what is reported as an error here."""
+    """Keep Dask from logging errors that are reported here."""
     import distributed  # noqa: F401 - which chooses levels of its own when it is imported
 
     loggers = [logging.getLogger(name) for name in LOGGERS]
@@ -251,15 +251,11 @@ def connected(scheduler: str, workers: int | None, tasks: int) -> Iterator[Any]:
     import distributed
 
     where: Any = slurm_cluster(scheduler, workers, tasks) if is_slurm(scheduler) else scheduler
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of other versions of packages
-            client = distributed.Client(where, timeout=CONNECTING, set_as_default=False, name="facediff")
-    except (OSError, TimeoutError, ValueError, TypeError, RuntimeError, ImportError) as error:
-        raise FaceDiffError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there within {CONNECTING:.0f} s "
-            f"({reason(error)}); start one with `dask scheduler`, or give the address that it prints"
-        ) from error
+    source = f"--scheduler {scheduler}: no Dask scheduler answers there within {CONNECTING:.0f} s"
+    remedy = "start one with `dask scheduler`, or give the address that it prints"
+    with damaged(source, remedy, OSError, RuntimeError, ImportError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of other versions of packages
+        client = distributed.Client(where, timeout=CONNECTING, set_as_default=False, name="facediff")
     try:
         yield client
     finally:
@@ -287,9 +283,9 @@ def slurm_cluster(scheduler: str, workers: int | None, tasks: int) -> Any:  # no
     """Jobs of SLURM that are workers, by dask-jobqueue; started once in a process, and cancelled when it ends.
 
     Args:
-        scheduler: ``slurm``, or ``slurm:OPTION=VALUE,…`` with options of ``dask_jobqueue.SLURMCluster``; what is not
-            given is read from Dask's own configuration (``~/.config/dask/jobqueue.yaml``).
-        workers: how many; those of one job if None.
+        scheduler: ``slurm``, or ``slurm:OPTION=VALUE,…`` with options of ``dask_jobqueue.SLURMCluster``; others
+            are read from Dask's own configuration (``~/.config/dask/jobqueue.yaml``).
+        workers: how many; as many as in one job if None.
         tasks: no more are started than there are tasks.
     """
     options = slurm_options(scheduler)
@@ -298,12 +294,12 @@ def slurm_cluster(scheduler: str, workers: int | None, tasks: int) -> Any:  # no
             raise FaceDiffError(f"--scheduler {scheduler}: there is no program sbatch; run facediff where SLURM is")
         import dask_jobqueue
 
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of a dashboard at another port
-                cluster = dask_jobqueue.SLURMCluster(**options)
-        except (ValueError, TypeError, OSError, RuntimeError) as error:
-            raise FaceDiffError(f"--scheduler {scheduler}: {reason(error)}; see docs/cluster.md") from error
+        with (
+            damaged(f"--scheduler {scheduler}", "see docs/cluster.md", OSError, RuntimeError),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")  # of a dashboard at another port
+            cluster = dask_jobqueue.SLURMCluster(**options)
         refuse_job(scheduler, cluster.job_script())
         _clusters[scheduler] = cluster
         print("facediff: waiting for SLURM to start workers", file=sys.stderr, flush=True)
@@ -318,9 +314,9 @@ def refuse_job(scheduler: str, script: str) -> None:
         file.write(script)
         file.flush()
         command = ["sbatch", "--test-only", file.name]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
-    if done.returncode:
-        raise FaceDiffError(f"--scheduler {scheduler}: SLURM refuses the job ({' '.join(done.stderr.split())})")
+        completed = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    if completed.returncode:
+        raise FaceDiffError(f"--scheduler {scheduler}: SLURM refuses the job ({' '.join(completed.stderr.split())})")
 
 
 def slurm_options(scheduler: str) -> dict[str, Any]:
@@ -361,8 +357,8 @@ def problem(run: ClusterRun) -> str:
         return f"does not see the folder {run.folder}; run on storage that all machines share"
     for path, expected in run.files.items():
         if not matches(path, expected):
-            shown = os.path.dirname(os.path.dirname(path)) if path.endswith(f"{os.sep}token") else path
-            return f"does not see the same {shown}; use storage that all machines share, under one name"
+            folder = os.path.dirname(os.path.dirname(path)) if path.endswith(f"{os.sep}token") else path
+            return f"does not see the same {folder}; use storage that all machines share, under one name"
     return ""
 
 

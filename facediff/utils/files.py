@@ -21,21 +21,15 @@ from typing import IO
 from weakref import WeakSet
 
 from facediff.errors import FaceDiffError, printable
-from facediff.utils.destinations import destination, refuse_protected
+from facediff.utils.output_paths import destination, refuse_protected
 
 ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then even where the file system has no locks
 
 
 def cache_dir() -> Path:
     """Where data is kept that can be computed again: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
-    if named := os.environ.get("FACEDIFF_CACHE"):
-        return Path(named)
-    try:
-        return Path.home() / ".cache" / "facediff"
-    except RuntimeError:
-        raise FaceDiffError(
-            "this user has no home directory; set the variable FACEDIFF_CACHE to a folder for what can be made again"
-        ) from None
+    folder = os.environ.get("FACEDIFF_CACHE")
+    return Path(folder) if folder else Path.home() / ".cache" / "facediff"
 
 
 def config_dir() -> Path:
@@ -59,7 +53,7 @@ def atomic(path: Path) -> Iterator[Path]:
     owner and its permissions on.
 
     Yields:
-        a temporary path next to the file, which is renamed at the end and removed if anything fails. Its suffix is that
+        a temporary path next to the file, which is renamed at the end and removed if anything fails. It has the suffix
         of ``path``, since many writers choose the format by it.
 
     Example:
@@ -114,11 +108,11 @@ def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
     Yields:
         a hidden folder next to ``path``, to be filled. It is renamed to ``path`` at the end and removed if anything
-        fails; what a killed process has left of the same folder is removed by the next one that writes it.
+        fails; leftovers of a killed process are removed by the next one that writes the folder.
     """
     if path.exists() and (not path.is_dir() or (not replace and any(path.iterdir()))):
-        what = "is not empty" if path.is_dir() else "is a file"
-        raise FaceDiffError(f"{path}: {what}; choose a new folder, or remove this one")
+        fault = "is not empty" if path.is_dir() else "is a file"
+        raise FaceDiffError(f"{path}: {fault}; choose a new folder, or remove this one")
     with scratch_folder(path) as scratch:
         content = scratch / path.name
         content.mkdir()
@@ -126,9 +120,8 @@ def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
             yield content
         except FaceDiffError as error:
             # A writer that fails names the folder that it was given; users know the one that they asked for.
-            if str(content) not in str(error):
-                raise
-            raise FaceDiffError(str(error).replace(str(content), str(path))) from error
+            renamed = FaceDiffError(str(error).replace(str(content), str(path)))
+            raise (renamed if str(content) in str(error) else error) from error
         put_in_place(content, path, replace=replace)
 
 
@@ -140,10 +133,10 @@ def scratch_folder(path: Path) -> Iterator[Path]:
     :class:`FaceDiffError` that names ``path``.
     """
     with _writing(path):
-        place = destination(path)
-        with _new_folders(place.parent):
-            sweep(place.parent)
-            folder = _partial(place)
+        target = destination(path)
+        with _new_folders(target.parent):
+            sweep(target.parent)
+            folder = _partial(target)
             # The folder is locked before it gets its name, so that no other process removes it as abandoned.
             unnamed = folder.with_name(f"{folder.name}{UNLOCKED}")
             unnamed.mkdir()
@@ -162,24 +155,24 @@ def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
     As in :func:`atomic`, links are followed, and owner and permissions of a file stay. Without ``replace``, only an
     empty folder may be replaced.
     """
-    place = destination(target)
-    if place.is_dir():
+    path = destination(target)
+    if path.is_dir():
         refuse_protected(target, folder=True)
     else:
-        _refuse_unwritable(target, place)
-        _hand_on(place, source)
+        _refuse_unwritable(target, path)
+        _hand_on(path, source)
     try:
-        _rename(source, place, replace=replace)
+        _rename(source, path, replace=replace)
     except OSError as error:
         if error.errno != errno.EXDEV:
             raise
-        copy = _copied_next_to(place, source)  # a link leads to another disk
+        copy = _copied_next_to(path, source)  # a link leads to another disk
         try:
-            _rename(copy, place, replace=replace)
+            _rename(copy, path, replace=replace)
         finally:
             _remove(copy)
         _remove(source)
-    _note_swept(place.parent)
+    _note_swept(path.parent)
 
 
 def _rename(source: Path, target: Path, *, replace: bool) -> None:
@@ -209,17 +202,17 @@ def _rename(source: Path, target: Path, *, replace: bool) -> None:
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def _exchange(one: Path, other: Path) -> bool:
+def _exchange(first: Path, second: Path) -> bool:
     """Let two folders change their names in one step, which no kill can interrupt; False where that is impossible."""
     import ctypes
 
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
-    here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE
-    return rename is not None and rename(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0
+    cwd, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE
+    return rename is not None and rename(cwd, os.fsencode(first), cwd, os.fsencode(second), exchange) == 0
 
 
-def _copied_next_to(place: Path, source: Path) -> Path:
-    copy = _partial(place)
+def _copied_next_to(target: Path, source: Path) -> Path:
+    copy = _partial(target)
     copy = copy.with_name(f"{copy.name}{UNLOCKED}")
     try:
         if source.is_dir():
@@ -235,27 +228,27 @@ def _copied_next_to(place: Path, source: Path) -> Path:
 def _hand_on(old: Path, new: Path) -> None:
     """Give a new file the owner and the permissions of the one that it replaces."""
     try:
-        before, now = old.stat(), new.stat()
+        before, after = old.stat(), new.stat()
     except OSError:
         return
-    if (before.st_uid, before.st_gid) != (now.st_uid, now.st_gid):
+    if (before.st_uid, before.st_gid) != (after.st_uid, after.st_gid):
         with suppress(OSError):
             os.chown(new, before.st_uid, before.st_gid)
     with suppress(OSError):
         os.chmod(new, before.st_mode & 0o777)
 
 
-def _refuse_unwritable(path: Path, place: Path) -> None:
+def _refuse_unwritable(path: Path, target: Path) -> None:
     """Refuse to replace an input, or a file that is protected against writing: renaming would not ask."""
     refuse_protected(path)
     with suppress(FileNotFoundError, NotADirectoryError):
-        if not place.stat().st_mode & 0o222:  # root may write to everything, but not against somebody's wish
+        if not target.stat().st_mode & 0o222:  # root may write to everything, but not against the owner's wish
             raise PermissionError(errno.EACCES, "the file is write-protected", str(path))
-        os.close(os.open(place, os.O_WRONLY))  # changes nothing; fails where permissions or the disk forbid to write
+        os.close(os.open(target, os.O_WRONLY))  # changes nothing; fails where permissions or the disk forbid to write
 
 
 def holds_glb(path: Path) -> bool:
-    """Whether what is written is a .glb, or .fbx, which is made of one.
+    """Whether a file is a .glb, or .fbx, which is made of one.
 
     Example:
         >>> [holds_glb(Path(name)) for name in ("a.glb", "a.FBX", "a.obj")]
@@ -314,16 +307,17 @@ def _partial(path: Path, suffix: str = "") -> Path:
     # Containers that share a folder may have equal process numbers, hence the token.
     name = path.name.removesuffix(path.suffix) if suffix else path.name
     owner = f"{_host()}-{os.getpid()}-{_start_of(os.getpid())}-{secrets.token_hex(4)}"
-    return path.with_name(f".{short_name(name, LONGEST)}.partial-{owner}{_short_suffix(suffix)}")
+    suffix = suffix if len(os.fsencode(suffix)) <= 24 else ""  # no format has a longer one
+    return path.with_name(f".{short_name(name, LONGEST)}.partial-{owner}{suffix}")
 
 
-def short_name(name: str, most: int) -> str:
-    """A name of at most ``most`` bytes: itself, or its beginning with a checksum of the whole."""
-    whole = os.fsencode(name)
-    if len(whole) <= most:
+def short_name(name: str, length: int) -> str:
+    """A name of at most ``length`` bytes: itself, or its beginning with a checksum of all of it."""
+    encoded = os.fsencode(name)
+    if len(encoded) <= length:
         return name
-    mark = f"~{zlib.crc32(whole):08x}"
-    while len(os.fsencode(name)) + len(mark) > most:
+    mark = f"~{zlib.crc32(encoded):08x}"
+    while len(os.fsencode(name)) + len(mark) > length:
         name = name[:-1]
     return name + mark
 
@@ -331,10 +325,6 @@ def short_name(name: str, most: int) -> str:
 def valid_text(name: str) -> str:
     """A file's name as text that every format can hold; bytes that are no UTF-8 become the replacement character."""
     return os.fsencode(name).decode(errors="replace")
-
-
-def _short_suffix(suffix: str) -> str:
-    return suffix if len(os.fsencode(suffix)) <= 24 else ""  # no format has a longer one
 
 
 def sweep(folder: Path) -> None:
@@ -349,9 +339,9 @@ def sweep(folder: Path) -> None:
         left = Path(entry.path)
         with suppress(OSError):
             if entry.is_dir(follow_symlinks=False):
-                with _locked_folder(left) as free:
-                    unlocked = free is None or left.name.endswith(UNLOCKED)
-                    if free is not False and (not unlocked or _is_abandoned(left)):
+                with _locked_folder(left) as lock:
+                    unlocked = lock is None or left.name.endswith(UNLOCKED)
+                    if lock is not False and (not unlocked or _is_abandoned(left)):
                         shutil.rmtree(left, ignore_errors=True)
             elif _is_abandoned(left):
                 left.unlink(missing_ok=True)
@@ -367,13 +357,9 @@ def _is_abandoned(left: Path) -> bool:
     if owner is None:
         return False
     if owner["host"] != _host():
-        return _is_old(left)
+        return time.time() - left.stat().st_mtime > ABANDONED_AFTER
     process = int(owner["process"])
     return not _is_running(process) or owner["start"] != _start_of(process)
-
-
-def _is_old(left: Path) -> bool:
-    return time.time() - left.stat().st_mtime > ABANDONED_AFTER
 
 
 @cache
@@ -436,15 +422,15 @@ def _writing(path: Path) -> Iterator[None]:
 @contextmanager
 def _new_folders(folder: Path) -> Iterator[None]:
     """Make a folder and its parents; those that are still empty at the end are removed."""
-    missing = [place for place in (folder, *folder.parents) if not os.path.lexists(place)]
+    folders = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
     try:
-        for place in [*reversed(missing), folder]:  # one by one: pathlib calls itself for each of a thousand parents
-            place.mkdir(exist_ok=True)
+        for path in [*reversed(folders), folder]:  # one by one: pathlib calls itself for each of a thousand parents
+            path.mkdir(exist_ok=True)
         yield
     finally:
-        for place in missing:
+        for path in folders:
             with suppress(OSError):  # not empty
-                place.rmdir()
+                path.rmdir()
 
 
 # Locks.
@@ -454,12 +440,8 @@ def _new_folders(folder: Path) -> Iterator[None]:
 def locked(path: Path, command: str) -> Iterator[None]:
     """Keep a second process out of a folder while the block runs; the lock of a killed process does not count.
 
-    The lock file lies in the folder, says who holds it, and is removed at the end; errors call the other process
-    ``command``.
-
-    Raises:
-        LockedError: if another process is at work.
-        FaceDiffError: if the folder cannot be written.
+    The lock file lies in the folder, names its process, and is removed at the end. If another process is at work, the
+    :class:`LockedError` calls it ``command``.
     """
     with ExitStack() as stack:
         with _writing(path.parent):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, needs_extra
+from facediff.errors import FaceDiffError, damaged, needs_extra
 
 HDF5_SUFFIXES = (".hdf5", ".h5")
 ROTATION = 3
@@ -30,42 +30,35 @@ def read_frames(path: Path, widths: Mapping[str, int]) -> dict[str, Array]:
     """
     with needs_extra("h5py", "prepare", "reading FLAME reconstructions (.hdf5)"):
         import h5py
-    try:
-        with h5py.File(path, "r") as file:
-            holder = file if "exp" in file else file.get("data", file)
-            # hickle keeps the quotes of a key as part of its name.
-            names = {name.strip("\"'"): name for name in holder}
-            if absent := [name for name in widths if name not in names]:
-                raise FaceDiffError(
-                    f"{path}: has no {', '.join(absent)} (it has {', '.join(sorted(names)) or 'nothing'}); expected "
-                    f"{', '.join(widths)}, as shape_pose_cam.hdf5 has them"
-                )
-            frames = {}
-            for name, width in widths.items():
-                dataset = holder[names[name]]
-                # A file from elsewhere must not make facediff read other files of this machine.
-                if dataset.file.filename != file.filename or dataset.external or dataset.is_virtual:
-                    raise FaceDiffError(f"{path}: {name} lies in another file; expected a file that holds its own data")
-                frames[name] = as_frames(dataset[()], width, f"{path}: {name}", exact=width == ROTATION)
-            return frames
-    except (OSError, LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise FaceDiffError(f"{path}: not a readable HDF5 file, perhaps truncated ({error}); get it again") from error
+    remedy = f"expected {', '.join(widths)} as in shape_pose_cam.hdf5; get the file again if it is truncated"
+    with damaged(path, remedy, OSError, RuntimeError), h5py.File(path, "r") as file:
+        holder = file if "exp" in file else file.get("data", file)
+        # hickle keeps the quotes of a key as part of its name.
+        names = {name.strip("\"'"): name for name in holder}
+        frames = {}
+        for name, width in widths.items():
+            dataset = holder[names[name]]
+            # A file from elsewhere must not make facediff read other files of this machine.
+            if dataset.file.filename != file.filename or dataset.external or dataset.is_virtual:
+                raise ValueError(f"{name} lies in another file")
+            frames[name] = as_frames(dataset[()], width, f"{path}: {name}", exact=width == ROTATION)
+        return frames
 
 
-def as_frames(values: npt.NDArray[np.generic], most: int, where: str, *, exact: bool) -> Array:
+def as_frames(values: npt.NDArray[np.generic], columns: int, where: str, *, exact: bool) -> Array:
     """(T, D) from (1, T, D), the way in which these projects keep a batch of one.
 
     Args:
         values: as the file has them.
-        most: most columns.
+        columns: how many columns there may be.
         where: what messages call them.
         exact: whether there are exactly so many; of shape and expression, the last coefficients may be left out.
     """
     frames = values[0] if values.ndim == 3 and len(values) == 1 else values
     fits = frames.dtype.kind in "fiu" and frames.ndim == 2 and len(frames)
-    if not fits or not (most if exact else 1) <= frames.shape[1] <= most:
+    if not fits or not (columns if exact else 1) <= frames.shape[1] <= columns:
         raise FaceDiffError(
             f"{where} has shape {values.shape} of {values.dtype}; expected (1, frames, {'' if exact else 'up to '}"
-            f"{most}) of numbers, with at least one frame"
+            f"{columns}) of numbers, with at least one frame"
         )
     return frames.astype(np.float64)

@@ -1,8 +1,8 @@
-"""Values and type hints: whether a value fits a hint, what a hint asks for in words, and what plain data becomes by it.
+"""Values and type hints: whether a value fits a hint, the hint in words, and plain data converted by it.
 
 It is the one checker of values. Options of the command line, of Python's dataclasses and of decorated functions, the
-constructors of models, components, corpora and callbacks, the trainer's numbers and what a checkpoint states all pass
-here, each at the door where it enters. Which numbers are allowed is part of the type: ``Annotated[int, Range(1, 8)]``.
+constructors of models, components, corpora and callbacks, the trainer's numbers and the arguments in a checkpoint all
+pass here, each at the door where it enters. Ranges of numbers are part of the type: ``Annotated[int, Range(1, 8)]``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Range:
         most: the largest number, which is included unless ``below`` is set.
         above: whether ``least`` itself is left out.
         below: whether ``most`` itself is left out.
-        items: for lists, whose every item must lie in the range, the fewest and the most items.
+        items: for lists, in which every item must lie in the range, the fewest and the most items.
 
     Example:
         >>> 0.5 in Range(0, 1, below=True)
@@ -92,7 +92,7 @@ class Range:
     __repr__ = __str__  # the help of Lightning's commands shows type hints as Python does
 
     def numbers(self, *, whole: bool = False) -> str:
-        """What is expected, in words: ``a whole number from 1 to 8``."""
+        """The range in words: ``a whole number from 1 to 8``."""
         bounded = math.isfinite(self.least) and math.isfinite(self.most)
         noun = "a whole number" if whole else "a number" if bounded else "a finite number"
         return f"{noun} {self}".strip()
@@ -137,7 +137,7 @@ def fits(hint: Any, value: object, limits: Range = Range(), *, stored: bool = Fa
     """Whether a value is one of a type hint.
 
     Args:
-        hint: the type hint. What is no plain type, such as a class of ours, takes everything that is not stored.
+        hint: the type hint. Other types than plain ones, such as our classes, take everything that is not stored.
         value: the value.
         limits: of numbers, where the hint states none.
         stored: whether a file states the value. Then it must be plain data that cannot be read as anything but itself:
@@ -203,7 +203,7 @@ def _entries_fit(inner: tuple[Any, ...], value: object, *, stored: bool) -> bool
 
 
 def mismatch(hint: Any, value: object) -> str | None:  # noqa: ANN401 - a type hint
-    """What was expected of a value that does not fit its type hint; None if it fits.
+    """The words for a type hint that a value does not fit; None if it fits.
 
     Example:
         >>> mismatch(Annotated[int, Range(1, 8)], 9)
@@ -213,7 +213,7 @@ def mismatch(hint: Any, value: object) -> str | None:  # noqa: ANN401 - a type h
 
 
 def describe(hint: Any, limits: Range = Range()) -> str:  # noqa: ANN401, B008 - a type hint; a frozen dataclass
-    """What a type hint asks for, in words.
+    """A type hint in words.
 
     Example:
         >>> describe(Annotated[float, Range(0, 1)] | None)
@@ -229,14 +229,14 @@ def describe(hint: Any, limits: Range = Range()) -> str:  # noqa: ANN401, B008 -
     if hint in (int, float):
         return limits.numbers(whole=hint is int)
     if origin in (list, tuple, set, frozenset, collections.abc.Sequence):
-        each = f", each {describe(inner[0], limits)}" if inner else ""
-        return f"a list of {limits.items[0]} to {limits.items[1]} items{each}"
+        items = f", each {describe(inner[0], limits)}" if inner else ""
+        return f"a list of {limits.items[0]} to {limits.items[1]} items{items}"
     if isinstance(origin or hint, type) and issubclass(origin or hint, Mapping):
         return "a mapping"
     if getattr(hint, "_is_protocol", False):
         return "a component's class"
-    words = {bool: "true or false", str: "text", Path: "a path", types.NoneType: "null", None: "null"}
-    return words.get(hint, "a plain value" if hint is Any else str(getattr(hint, "__name__", hint)))
+    phrases = {bool: "true or false", str: "text", Path: "a path", types.NoneType: "null", None: "null"}
+    return phrases.get(hint, "a plain value" if hint is Any else str(getattr(hint, "__name__", hint)))
 
 
 def convert(hint: Any, value: Any) -> Any:  # noqa: ANN401 - a type hint and its value
@@ -300,12 +300,12 @@ def check_number(
     Args:
         source: the file, for the message.
         name: the number's name in the file.
-        value: what the file holds.
+        value: from the file.
         low: smallest allowed number.
         high: largest allowed number.
         whole: whether it must be a whole number.
         text: whether the file holds it as text, as tables do.
-        remedy: what the message advises.
+        remedy: advice at the end of the message.
 
     Example:
         >>> check_number("manifest.json", "frame_rate", 25, 0.1, 1000)
@@ -370,7 +370,7 @@ def is_name(text: object) -> bool:
     )
 
 
-# Doors: the fields of a dataclass, the arguments of a function, those of a constructor.
+# Doors: the fields of a dataclass, the arguments of a function and of a constructor.
 
 
 @functools.cache
@@ -384,8 +384,8 @@ def hints_of(owner: Any) -> dict[str, Any]:  # noqa: ANN401 - a function or a cl
     hints: dict[str, Any] = {}
     for name, hint in owner.__annotations__.items():
         with suppress(NameError, TypeError):
-            alone = SimpleNamespace(__annotations__={name: hint})
-            hints |= typing.get_type_hints(alone, module, include_extras=True)
+            stub = SimpleNamespace(__annotations__={name: hint})
+            hints |= typing.get_type_hints(stub, module, include_extras=True)
     return hints
 
 
@@ -416,12 +416,12 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
     signature = inspect.signature(function)
 
     @functools.wraps(function)
-    def call(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
-        for name, value in signature.bind(*arguments, **named).arguments.items():
+    def call(*values: Arguments.args, **options: Arguments.kwargs) -> Result:
+        for name, value in signature.bind(*values, **options).arguments.items():
             hint = hints_of(function).get(name)
             if value is not None and range_of(hint) is not None and (expected := mismatch(hint, value)) is not None:
                 raise FaceDiffError(f"{function.__name__}.{name} {shown(value)}: out of range; expected {expected}")
-        return function(*arguments, **named)
+        return function(*values, **options)
 
     return call
 
@@ -429,12 +429,12 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = "") -> Callable[..., None]:
     """Let a constructor refuse values that do not fit the types and ranges of its signature.
 
-    Whatever else it raises because of a value is reported in the same way: as one sentence that names the arguments
-    as the user wrote them.
+    Other errors that it raises because of a value are reported in the same way, in one sentence that names the
+    arguments as the user wrote them.
 
     Args:
         init: the constructor; its numbers state their ranges as ``Annotated[int, Range(...)]``.
-        path: what comes before the argument's name in an option; the object's ``options_path``, or else its class's
+        path: prefix of the argument's name in an option; the object's ``options_path``, or else its class's
             name, if empty.
         sizes: the same for arguments without a default, which are options of the owner.
     """
@@ -460,9 +460,13 @@ def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = 
             raise error if error.located else error.at(located) from error.__cause__
         except (ValueError, RuntimeError, ArithmeticError, MemoryError) as error:
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            named = {located(name): value for name, value in arguments.items() if isinstance(value, int | float | str)}
+            arguments = {
+                located(name): value for name, value in arguments.items() if isinstance(value, int | float | str)
+            }
             raise ArgumentError(
-                named or {owner: type(self).__name__}, f"{type(self).__name__} cannot be made ({reason})", located=True
+                arguments or {owner: type(self).__name__},
+                f"{type(self).__name__} cannot be made ({reason})",
+                located=True,
             ) from error
 
     return wrapped
@@ -479,9 +483,9 @@ def options_of(owner: type) -> dict[str, inspect.Parameter]:
         if not inspect.isfunction(init):
             continue
         declared = list(inspect.signature(init).parameters.values())[1:]
-        named = [p for p in declared if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
+        arguments = [p for p in declared if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
         hints = hints_of(init)
-        parameters = {p.name: p.replace(annotation=hints.get(p.name, Any)) for p in named} | parameters
+        parameters = {p.name: p.replace(annotation=hints.get(p.name, Any)) for p in arguments} | parameters
         if all(p.kind is not p.VAR_KEYWORD for p in declared):
             break
     return parameters

@@ -1,8 +1,8 @@
 """Where a model comes from: a checkpoint, a model folder, or the Hugging Face hub, from which it is fetched.
 
 Importing this costs nothing, so that commands can refuse a name at once. Fetched folders are kept in the hub's own
-cache (``HF_HOME``), where they are found again without network; ``HF_HUB_OFFLINE`` and ``HF_ENDPOINT`` mean what they
-mean to ``huggingface_hub``, through which everything goes.
+cache (``HF_HOME``), where they are found again without network; ``HF_HUB_OFFLINE`` and ``HF_ENDPOINT`` mean the
+same as to ``huggingface_hub``, through which everything goes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from facediff.errors import FaceDiffError, needs_extra
+from facediff.errors import FaceDiffError, damaged, needs_extra
 from facediff.utils.checksums import sha256
 
 CONFIG, WEIGHTS, ASSETS, CARD = "config.json", "model.safetensors", "assets.npz", "README.md"
@@ -63,7 +63,7 @@ def split_face(source: str | os.PathLike[str]) -> tuple[str, str | None]:
     """
     text = os.fspath(source)
     model, colon, face = text.rpartition(":")
-    # Neither a drive letter nor a file whose name has a colon.
+    # Neither a drive letter nor a file with a colon in its name.
     if len(model) < 2 or not re.fullmatch(r"[\w.-]+", face) or os.path.lexists(text):
         return text, None
     return (model, face) if os.path.exists(model) or hub_id(model) is not None else (text, None)  # noqa: PTH110
@@ -84,19 +84,22 @@ def check_model_source(source: str | os.PathLike[str], option: str = "", expecte
     """Refuse, before anything heavy is imported, what can be no trained model.
 
     Args:
-        source: what the user gave.
+        source: name or path that the user gave.
         option: the option that names it, for messages.
-        expected: what it should be, for messages.
+        expected: the expectation in messages.
     """
-    shown = f"{option} {source}".strip()
+    label = f"{option} {source}".strip()
     source, _ = split_face(source)
+    fault = ""
     if is_exported(bundled_by_name(source)):
-        raise FaceDiffError(f"{shown}: holds graphs, with which one can only animate; {EXPECTED}")
-    if os.path.isdir(source):  # noqa: PTH112 - also of a name with a NUL, which pathlib raises for
-        if missing := missing_files(Path(source)):
-            raise FaceDiffError(f"{shown}: this folder has no {missing}, so it holds no model; {expected}")
+        fault, expected = "holds graphs, with which one can only animate", EXPECTED
+    elif os.path.isdir(source):  # noqa: PTH112 - also of a name with a NUL, which pathlib raises for
+        names = missing_files(Path(source))
+        fault = f"this folder has no {names}, so it holds no model" if names else ""
     elif not os.path.isfile(source) and hub_id(source) is None:  # noqa: PTH113
-        raise FaceDiffError(f"{shown}: no such checkpoint; {expected}")
+        fault = "no such checkpoint"
+    if fault:
+        raise FaceDiffError(f"{label}: {fault}; {expected}")
 
 
 def missing_files(folder: Path) -> str:
@@ -138,12 +141,12 @@ def check_animating_source(source: str | os.PathLike[str]) -> None:
 
 
 def model_or_bundled(source: Source | None) -> Source | Path:
-    """The model that somebody named, or the one that comes with facediff; that none was named is said in a line."""
-    named = BUNDLED if source is None else bundled_by_name(source)
-    if named is BUNDLED and not is_exported(BUNDLED):
+    """The model of a name, or the one that comes with facediff, of which a line then tells."""
+    model_or_name = BUNDLED if source is None else bundled_by_name(source)
+    if model_or_name is BUNDLED and not is_exported(BUNDLED):
         raise FaceDiffError(f"--checkpoint: missing, and this copy of facediff has no model at {BUNDLED}; {EXPECTED}")
     if source is not None:
-        return named
+        return model_or_name
     print(
         f"no --checkpoint: {BUNDLED.name}, the model that comes with facediff; its speech and faces are synthetic",
         file=sys.stderr,
@@ -175,20 +178,20 @@ def local_model(source: str | os.PathLike[str]) -> Path:
 def _located(source: str | os.PathLike[str]) -> tuple[Path, str | None]:
     check_model_source(source)
     model, face = split_face(source)
-    named = hub_id(model)
-    return Path(model) if named is None else fetch(*named), face
+    hub_name = hub_id(model)
+    return Path(model) if hub_name is None else fetch(*hub_name), face
 
 
 def model_files(source: str | os.PathLike[str]) -> list[Path]:
-    """The files that decide what a model makes: the checkpoint, or those of the folder that hold numbers."""
+    """The files that decide a model's output: the checkpoint, or the files of the folder that hold numbers."""
     path = model_path(source)
     return [path / name for name in (CONFIG, WEIGHTS, ASSETS)] if path.is_dir() else [path]
 
 
 def model_hash(source: str | os.PathLike[str]) -> str:
-    """SHA-256 of a model: of the checkpoint's bytes, or over those of a folder's :func:`model_files`.
+    """SHA-256 of a model: of the checkpoint's bytes, or of a folder's :func:`model_files`.
 
-    A folder's card says what people think of a model, and not what it makes: it does not count.
+    A folder's card has no part in the output and does not count.
     """
     path = model_path(source)
     files = model_files(path)
@@ -206,13 +209,13 @@ def fetch(name: str, revision: str | None = None) -> Path:
     """The folder of a model of the hub, in the hub's cache on this machine."""
     with needs_extra("huggingface_hub", "hub", f"fetching the model {name}"):
         from huggingface_hub import snapshot_download
-    shown = name if revision is None else f"{name}@{revision}"
-    with _hub_errors(shown, "fetched"), _progress():
+    label = name if revision is None else f"{name}@{revision}"
+    with _hub_errors(label, "fetched"), _progress():
         options: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
         folder = Path(snapshot_download(name, **options))
-    if missing := missing_files(folder):
+    if names := missing_files(folder):
         raise FaceDiffError(
-            f"{shown}: this model of the hub has no {missing}, so facediff did not write it; expected a model that "
+            f"{label}: this model of the hub has no {names}, so facediff did not write it; expected a model that "
             f"`facediff publish --push` has sent there"
         )
     return folder
@@ -233,7 +236,7 @@ def push(folder: Path, name: str, *, private: bool = False) -> str:
 
 @contextmanager
 def _progress() -> Iterator[None]:
-    """Without the hub's progress bars where nobody sees them."""
+    """Without the hub's progress bars outside a terminal."""
     from huggingface_hub.utils.tqdm import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 
     quiet = sys.stderr is None or not sys.stderr.isatty()
@@ -247,16 +250,7 @@ def _progress() -> Iterator[None]:
         enable_progress_bars()
 
 
-@contextmanager
-def _hub_errors(name: str, done: str) -> Iterator[None]:
-    """What the hub's library raises, with the model's name."""
-    try:
-        yield
-    except FaceDiffError:
-        raise
-    except Exception as error:  # errors of the network are of the class of whichever library the hub's one uses
-        reason = " ".join(str(error).split())[:300]
-        raise FaceDiffError(
-            f"{name}: neither a file or folder here, nor can it be {done} ({reason}); check the name, go online, log "
-            f"in with `hf auth login` if it is private, or give a folder in its place"
-        ) from error
+def _hub_errors(name: str, action: str) -> AbstractContextManager[None]:
+    """Errors of the hub's library, and of the libraries that it uses, with the model's name."""
+    remedy = "check the name, go online, log in with `hf auth login` if it is private, or give a folder in its place"
+    return damaged(f"{name}: neither a file or folder here, nor can it be {action}", remedy, Exception)

@@ -31,7 +31,7 @@ def check_scheduler(scheduler: str | None) -> str:
     """Where tasks run: one of :data:`LOCAL`, the address of a Dask scheduler, ``slurm`` with options, or "" for here.
 
     Args:
-        scheduler: as ``--scheduler`` takes it; if None, what the environment variable :data:`ADDRESS` says.
+        scheduler: as ``--scheduler`` takes it; if None, the value of the environment variable :data:`ADDRESS`.
 
     Example:
         >>> check_scheduler("threads")
@@ -112,29 +112,29 @@ def run_tasks(
     """Do tasks in several workers, and yield each with its result as soon as it is done.
 
     No worker gets a task before it is free for it, and at most one result for each worker waits to be taken, so memory
-    is bounded and a stop waits only for what is running. Wrap the generator in :func:`contextlib.closing`, so that it
-    stops with the loop that takes the results: what is running then has some seconds to come to its end before its
+    is bounded and a stop waits only for running tasks. Wrap the generator in :func:`contextlib.closing`, so that it
+    stops with the loop that takes the results: running tasks then have some seconds to come to their end before their
     process is ended, and nothing else is begun. Workers ignore Ctrl-C; only this process reacts to it.
 
     Args:
         work: does a task. For processes and clusters: a picklable function or object, which each worker gets once and
             keeps, such as :class:`PerWorker`. A task may be done again if its worker is lost, so it writes its files
             whole or not at all.
-        tasks: what it is called with.
+        tasks: its arguments.
         workers: number of workers; as many as processors, or as the cluster has, if None. One process is not worth
             starting: its tasks are done in this process.
-        mode: what the workers are on this machine. Processes and threads compute on one processor each. Where processes
+        mode: kind of workers on this machine. Processes and threads compute on one processor each. Where processes
             cannot be started (programs read from standard input, scripts without a main guard), this process does the
             work.
         scheduler: where the tasks run, as the option ``--scheduler`` says: a mode that takes precedence over ``mode``,
-            a cluster (see :func:`check_scheduler`), or None for what the environment says. Here, if empty.
+            a cluster (see :func:`check_scheduler`), or None for the environment's. Here, if empty.
         writes: folder that tasks write to; workers of a cluster must see it, which is checked.
         reads: files and folders that tasks read; likewise.
         progress: title of a progress bar; none if empty.
 
     Yields:
         task and result, in the order in which they are done. The result of a task that kills its process is
-        :class:`WorkerDied`: what was running then is tried again, one at a time, so that no other is lost.
+        :class:`WorkerDied`: tasks that were running then are tried again, one at a time, so that no other is lost.
 
     Example:
         >>> dict(run_tasks(len, ["a", "bb"], mode="threads"))
@@ -157,17 +157,17 @@ def run_tasks(
 def in_order(
     results: Iterable[tuple[Task, Result | WorkerDied]], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result]]:
-    """Results in the order of the tasks, for sums whose last digit depends on it; tasks are hashable and different.
+    """Results in the order of the tasks, for sums with a last digit that depends on it; tasks are hashable.
 
     Example:
         >>> list(in_order([("b", 2), ("a", 1)], ["a", "b"]))
         [('a', 1), ('b', 2)]
     """
     early: dict[Task, Result] = {}
-    waiting = deque(tasks)
+    queue = deque(tasks)
     for task, result in results:
         if isinstance(result, WorkerDied):
             raise FaceDiffError(f"{task}: killed its process, perhaps for lack of memory; use fewer --workers")
         early[task] = result
-        while waiting and waiting[0] in early:
-            yield waiting[0], early.pop(waiting.popleft())
+        while queue and queue[0] in early:
+            yield queue[0], early.pop(queue.popleft())

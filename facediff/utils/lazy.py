@@ -1,4 +1,4 @@
-"""Packages whose public names are imported when they are first used.
+"""Packages with public names that are imported on first use.
 
 ``facediff.models`` imports Lightning, ``facediff.data`` too: seconds that a wrong option or ``--help`` must not cost.
 Depends on the standard library only.
@@ -15,7 +15,7 @@ from typing import Any
 def lazy_names(
     package: str, modules: Mapping[str, str], packages: str = ""
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are loaded on first use (PEP 562).
+    """``__getattr__``, ``__dir__`` and ``__all__`` of a package with names that are loaded on first use (PEP 562).
 
     Args:
         package: the package's ``__name__``.
@@ -46,7 +46,7 @@ def lazy_names(
 def late(target: str) -> Callable[..., Any]:
     """A function by its name, ``package.module:function``, imported when it is called for.
 
-    For methods of a plain class whose work is done by packages above it, which themselves work with the class.
+    For methods of a plain class that call packages above it, which themselves work with the class.
     """
     module, _, name = target.partition(":")
     function: Callable[..., Any] = getattr(importlib.import_module(module), name)

@@ -1,8 +1,8 @@
 """Licence labels: the terms of the data and networks that a model was made from, and whether they allow commercial use.
 
-A label repeats what the owner of a data set states in public, with the place where it stands; it is no legal advice.
+A label repeats the public terms of the owner of a data set, with the place where they stand; it is no legal advice.
 A model made from several things may be used only as far as all of them allow, so the strictest label decides
-(:func:`commercial_use`). Nobody is asked when nothing is known: unknown counts as not cleared.
+(:func:`commercial_use`). Unknown terms count as not cleared.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, astuple, dataclass
 from typing import Any, Literal, get_args
 
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import OptionError, damaged
 from facediff.utils.hints import is_plain_text
 from facediff.utils.limits import quoted
 
@@ -50,7 +50,7 @@ class Licence:
     """The terms of one thing that a model was made from.
 
     Attributes:
-        of: what it is, such as ``corpus biwi`` or ``weights``.
+        of: the licensed thing, such as ``corpus biwi`` or ``weights``.
         name: the licence, such as ``Apache-2.0``, or the terms in a few words.
         commercial: whether it allows commercial use.
         source: where that stands.
@@ -70,7 +70,7 @@ class Licence:
 
 
 def commercial_use(licences: Iterable[Licence]) -> Commercial:
-    """What the strictest of several licences says of commercial use; unknown if there are none.
+    """Commercial use by the strictest of several licences; unknown if there are none.
 
     Example:
         >>> commercial_use([Licence("corpus puppet", "Apache-2.0", "allowed"), Licence("speaker Eva")])
@@ -81,7 +81,7 @@ def commercial_use(licences: Iterable[Licence]) -> Commercial:
 
 
 def merged(*groups: Iterable[Licence]) -> tuple[Licence, ...]:
-    """The labels of what a model inherits from, each once."""
+    """The labels of a model's ancestors, each once."""
     return tuple(dict.fromkeys(licence for group in groups for licence in group))
 
 
@@ -109,7 +109,7 @@ def licence_metadata(licences: Iterable[Licence]) -> dict[str, str]:
 
 
 def known_licence(name: str) -> Commercial:
-    """What a licence says of commercial use, by its usual identifier; unknown for any other.
+    """Commercial use under a licence, by its usual identifier; unknown for any other.
 
     Example:
         >>> known_licence("Apache-2.0"), known_licence("cc-by-nc-4.0"), known_licence("ours")
@@ -119,7 +119,7 @@ def known_licence(name: str) -> Commercial:
 
 
 def require_cleared(source: object, licences: Iterable[Licence]) -> None:
-    """Refuse a model whose data or weights are not cleared for commercial use."""
+    """Refuse a model with data or weights that are not cleared for commercial use."""
     labels = list(licences)
     if commercial_use(labels) == "allowed":
         return
@@ -132,17 +132,11 @@ def require_cleared(source: object, licences: Iterable[Licence]) -> None:
 
 def read_licences(source: object, state: Any) -> tuple[Licence, ...]:  # noqa: ANN401 - whatever a file holds
     """The labels that a file holds."""
-    try:
+    with damaged(f"{source}: its licences", f"expected texts {', '.join(Licence.__dataclass_fields__)}"):
         labels = tuple(Licence(**entry) for entry in state)
-        known = all(label.commercial in get_args(Commercial) for label in labels)
-        fits = known and all(is_plain_text(text) for label in labels for text in astuple(label))
-    except TypeError:
-        fits = False
-    if not fits:
-        raise FaceDiffError(
-            f"{source}: its licences are {quoted(state)}; expected texts {', '.join(Licence.__dataclass_fields__)}, "
-            f"and of commercial use {', '.join(get_args(Commercial))}. The file is damaged"
-        )
+        plain = all(is_plain_text(text) for label in labels for text in astuple(label))
+        if not plain or any(label.commercial not in get_args(Commercial) for label in labels):
+            raise ValueError(f"are {quoted(state)}")
     return labels
 
 
@@ -152,17 +146,18 @@ def network_licences(options: Any) -> tuple[Licence, ...]:  # noqa: ANN401 - pla
     A network that was read from a folder is not known by its path; its licence is unknown.
     """
     if isinstance(options, Mapping):
-        own = options.get("_name_or_path")
+        network = options.get("_name_or_path")
         inner = merged(*(network_licences(value) for value in options.values()))
-        if not isinstance(own, str) or not own:  # no network, or one that was trained here from nothing
+        if not isinstance(network, str) or not network:  # no network, or one that was trained here from nothing
             return inner
-        name = SPEECH_NETWORKS.get(own)
-        shown = own if name is not None or re.fullmatch(r"[\w.-]+/[\w.-]+", own) else "from a folder"
+        name = SPEECH_NETWORKS.get(network)
+        on_hub = name is not None or re.fullmatch(r"[\w.-]+/[\w.-]+", network)
+        site = "github.com" if name == "MPL-2.0" else "model card huggingface.co"
         label = Licence(
-            f"audio encoder {shown}",
+            f"audio encoder {network if on_hub else 'from a folder'}",
             name or "unknown",
             known_licence(name or ""),
-            "" if not name else f"github.com/{own}" if name == "MPL-2.0" else f"model card huggingface.co/{own}",
+            f"{site}/{network}" if name else "",
         )
         return merged([label], inner)
     if isinstance(options, list | tuple):

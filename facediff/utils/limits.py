@@ -23,7 +23,7 @@ WORDS_SHOWN = 60  # characters of a file's own text that a message repeats
 
 
 def quoted(value: object) -> str:
-    """A value from a file as a message may show it: short, on one line, and whatever it is."""
+    """A value from a file as a message may show it: short and on one line."""
     try:
         text = " ".join(repr(value).split())  # arrays and tensors take several lines
     except Exception:  # a whole number of more than 4300 digits has no decimal form; other objects may raise anything
@@ -32,7 +32,7 @@ def quoted(value: object) -> str:
 
 
 def brief(error: object) -> str:
-    """What a library says of a damaged file, as a message may repeat it: short and on one line."""
+    """A library's words about a damaged file, as a message may repeat them: short and on one line."""
     text = " ".join(str(error).split()) or type(error).__name__
     text = "".join(character if character.isprintable() else "?" for character in text)
     return text if len(text) <= 2 * WORDS_SHOWN else f"{text[: 2 * WORDS_SHOWN - 1]}…"
@@ -48,8 +48,8 @@ def check_format(source: object, stated: object, expected: str | int) -> None:
     """
     if type(stated) is type(expected) and stated == expected:
         return
-    ours, theirs = _split_format(expected), _split_format(stated)
-    later = ours is not None and theirs is not None and theirs[0] == ours[0] and theirs[1] > ours[1]
+    mark, other_mark = _split_format(expected), _split_format(stated)
+    later = mark is not None and other_mark is not None and other_mark[0] == mark[0] and other_mark[1] > mark[1]
     advice = "it was written by a later version, update facediff" if later else "write the file again"
     raise FaceDiffError(f"{source}: its format is {quoted(stated)}; expected {expected!r}; {advice}")
 

@@ -17,7 +17,7 @@ CHUNK = 2**22
 """Distances that are held in memory at a time."""
 
 BLOCK = 128
-"""Samples whose response in a filter is one product of matrices."""
+"""Samples that pass a filter as one product of matrices."""
 
 
 def smooth_step(values: npt.ArrayLike) -> Array:
@@ -31,27 +31,27 @@ def has_scipy() -> bool:
     return importlib.util.find_spec("scipy") is not None
 
 
-def nearest_distances(points: Array, others: Array, limit: float = np.inf) -> Array:
+def nearest_distances(points: Array, targets: Array, limit: float = np.inf) -> Array:
     """Distance (P,) of each point (P, 3) to the nearest of others (Q, 3); infinite where it is ``limit`` or more."""
     if has_scipy():
         from scipy.spatial import cKDTree
 
-        return cast(Array, cKDTree(others).query(points, distance_upper_bound=limit)[0])
-    return nearest_by_chunks(points, others, limit)
+        return cast(Array, cKDTree(targets).query(points, distance_upper_bound=limit)[0])
+    return nearest_by_chunks(points, targets, limit)
 
 
-def nearest_by_chunks(points: Array, others: Array, limit: float = np.inf) -> Array:
+def nearest_by_chunks(points: Array, targets: Array, limit: float = np.inf) -> Array:
     """The same by all distances."""
-    rows = max(1, CHUNK // max(1, len(others)))
+    rows = max(1, CHUNK // max(1, len(targets)))
     nearest = np.empty(len(points))
     for begin in range(0, len(points), rows):
-        apart = points[begin : begin + rows, None] - others[None]
+        apart = points[begin : begin + rows, None] - targets[None]
         nearest[begin : begin + rows] = np.sqrt(np.square(apart).sum(-1).min(1))
     return np.where(nearest < limit, nearest, np.inf)
 
 
 def solve_block_chain(diagonal: Array, coupling: Array, right: Array) -> Array:
-    """Solve a symmetric positive definite system whose blocks are coupled to their neighbours by diagonal matrices.
+    """Solve a symmetric positive definite system of blocks that diagonal matrices couple to their neighbours.
 
     Args:
         diagonal: (T, K, K) the blocks on the diagonal.
@@ -112,7 +112,7 @@ class _Section:
             powers.append(transition @ powers[-1])
         impulse = np.array([b0, *(float((powers[n] @ entry)[0]) for n in range(BLOCK - 1))])
         lag = np.arange(BLOCK)[:, None] - np.arange(BLOCK)[None]
-        # What a block's samples give in the same block; what its state gives there; and the state after n samples.
+        # The response to a block's samples in the same block; the response to its state; and the state after n samples.
         self._direct = np.where(lag >= 0, impulse[np.maximum(lag, 0)], 0.0)
         self._free = np.stack([power[0] for power in powers[:BLOCK]])
         self._entries = np.stack([power @ entry for power in powers[:BLOCK]])
@@ -120,14 +120,14 @@ class _Section:
         self._state = np.zeros(2)
 
     def feed(self, samples: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        whole = len(samples) // BLOCK * BLOCK
-        blocks = samples[:whole].reshape(-1, BLOCK)
+        full = len(samples) // BLOCK * BLOCK
+        blocks = samples[:full].reshape(-1, BLOCK)
         filtered = blocks @ self._direct.T
         gained = blocks @ self._entries[::-1]
         for row, gain in zip(filtered, gained, strict=True):
             row += self._free @ self._state
             self._state = self._powers[BLOCK] @ self._state + gain
-        rest = samples[whole:]
+        rest = samples[full:]
         count = len(rest)
         last = self._direct[:count, :count] @ rest + self._free[:count] @ self._state
         if count:

@@ -1,4 +1,4 @@
-"""What a type hint cannot say about an option of the command line.
+"""The properties of a command-line option beyond its type hint.
 
 Stands below all packages, so that the dataclasses of options can carry it; :mod:`facediff.cli.parsing` reads it.
 """
@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Option:
-    """What a type hint cannot say about an option; used as ``Annotated[float, Option(...)]``.
+    """The properties of an option beyond its type hint; used as ``Annotated[float, Option(...)]``.
 
     Which numbers an option takes is declared by a :class:`~facediff.utils.hints.Range`.
 
@@ -24,10 +24,10 @@ class Option:
         needs: names of options, separated by spaces, without all of which this one would change nothing.
         without: names of options with any of which this one would change nothing.
         reads: for paths, and texts that hold paths: whether the file or folder is read.
-        exists: for paths: what must be there, if it is known before the command begins.
-        writes: for paths: what is written; with ``reads``, what exists is read instead.
+        exists: for paths: kind of the input that must exist, if it is known before the command begins.
+        writes: for paths: kind of the output; with ``reads``, an existing one is read instead.
         new: for paths that are written: whether they must not exist, or be empty folders.
-        suffixes: for paths: what their names may end in.
+        suffixes: for paths: allowed ends of their names.
         dash: for paths: whether ``-`` stands for standard input or output.
         check: raises an error for a value that the command cannot use.
         hidden: for fields of a dataclass: whether programs set it, and the command line has no such option.

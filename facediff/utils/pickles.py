@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from facediff.errors import FaceDiffError
+from facediff.errors import damaged
 from facediff.utils.limits import brief
 
 PLAIN = re.compile(r"[<>|=]?(?:[biufc]\d{1,2}|[SU]\d+|\?)")
@@ -46,7 +46,7 @@ class PlainType:
 
 
 class PlainArray(np.ndarray[Any, Any]):
-    """An array whose state may only be of a plain type."""
+    """An array that takes only a state of a plain type."""
 
     def __setstate__(self, state: Any) -> None:  # noqa: ANN401
         """Version, shape, type, order, bytes."""
@@ -157,14 +157,14 @@ NAMES_OF_OBJECTS: dict[tuple[str, str], Any] = {
     **{(module, "_reconstructor"): MAKERS.make_object for module in ("copyreg", "copy_reg")},
     **{(module, "object"): object for module in BUILTINS},
 }
-"""Further names of pickles whose objects become stand-ins."""
+"""Further names in pickles of objects that become stand-ins."""
 
 
 class PlainUnpickler(pickle.Unpickler):
     """Unpickles NumPy arrays and plain containers, and nothing else.
 
     Attributes:
-        stand_ins: packages whose objects become :class:`StandIn`; nothing of these packages is imported.
+        stand_ins: packages with objects that become :class:`StandIn`; nothing of these packages is imported.
     """
 
     stand_ins: tuple[str, ...] = ()
@@ -186,15 +186,10 @@ def load_pickle(path: Path, *, stand_ins: tuple[str, ...] = ()) -> Any:  # noqa:
 
     Args:
         path: the file.
-        stand_ins: packages (``scipy.sparse``) whose objects become :class:`StandIn`.
+        stand_ins: packages (``scipy.sparse``) with objects that become :class:`StandIn`.
     """
-    try:
-        with path.open("rb") as stream:
-            unpickler = PlainUnpickler(stream, encoding="latin1")
-            unpickler.stand_ins = stand_ins
-            return unpickler.load()
-    except Exception as error:
-        raise FaceDiffError(
-            f"{path}: not a pickle of plain NumPy arrays ({brief(error)}); it was not run. Expected the file as the "
-            f"data set's authors distribute it"
-        ) from error
+    remedy = "it was not run. Expected the file as the data set's authors distribute it"
+    with damaged(f"{path}: not a pickle of plain NumPy arrays", remedy, Exception), path.open("rb") as stream:
+        unpickler = PlainUnpickler(stream, encoding="latin1")
+        unpickler.stand_ins = stand_ins
+        return unpickler.load()

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.files import atomic
 
 # JSON.
@@ -27,14 +27,11 @@ def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a J
         source: what messages call it.
         remedy: how messages end.
     """
-    try:
+    hooks: dict[str, Any] = {"parse_constant": _finite, "parse_float": _finite, "parse_int": _whole}
+    with damaged(f"{source}: not readable as JSON", remedy, RecursionError):
         if isinstance(text, bytes):
             text = text.decode(json.detect_encoding(text))
-        return json.loads(
-            text, parse_constant=_finite, parse_float=_finite, parse_int=_whole, object_pairs_hook=_unique
-        )
-    except (ValueError, RecursionError) as error:
-        raise FaceDiffError(f"{source}: not readable as JSON ({error}); {remedy}") from error
+        return json.loads(text, **hooks, object_pairs_hook=_unique)
 
 
 def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file") -> Any:  # noqa: ANN401
@@ -50,10 +47,8 @@ def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file
 
 def read_bytes(path: Path, *, name: str = "", remedy: str) -> bytes:
     """The bytes of a file; arguments as in :func:`load_json`."""
-    try:
+    with damaged(f"{name or path}: cannot be read", remedy, OSError):
         return path.read_bytes()
-    except OSError as error:
-        raise FaceDiffError(f"{name or path}: cannot be read ({error.strerror or error}); {remedy}") from error
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
@@ -89,12 +84,8 @@ def json_text(
     path: Path | str, content: Mapping[str, Any], *, indent: int | None = 1, ensure_ascii: bool = False
 ) -> str:
     """An object as the text of a JSON file, which has no words for numbers that are not finite."""
-    try:
+    with damaged(f"{path}: would hold a number that is NaN or infinite", "expected finite inputs, check them"):
         return json.dumps(content, indent=indent, ensure_ascii=ensure_ascii, allow_nan=False)
-    except ValueError as error:
-        raise FaceDiffError(
-            f"{path}: would hold a number that is NaN or infinite; expected finite inputs, check them"
-        ) from error
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -107,7 +98,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 # CSV.
 
-# A spreadsheet takes a cell that begins with one of these as a formula, and runs it. Names come from files of anybody,
+# A spreadsheet takes a cell that begins with one of these as a formula, and runs it. Names come from foreign files,
 # so that such a cell is written with an apostrophe in front (as OWASP advises), which our own readers take away again.
 # A cell that already looks like that gets one more, so that every text is read back as it was. Numbers stay numbers.
 _FORMULA = tuple("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
@@ -161,25 +152,22 @@ def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
     Yields:
         the cells as :func:`csv_text` gives them; the header is the first.
     """
-    try:
+    with damaged(f"{path}: not readable as a UTF-8 table", remedy, OSError, csv.Error):
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            for number, row in enumerate(csv.reader(stream)):
-                if number == 0 and len(row) == 1 and ";" in row[0]:
-                    raise FaceDiffError(f"{path}: row 1: has semicolons between its columns; save it with commas")
-                if row:
-                    yield [csv_text(cell) for cell in row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FaceDiffError(f"{path}: not readable as a UTF-8 table ({error}); {remedy}") from error
+            rows = list(csv.reader(stream))
+        if rows and len(rows[0]) == 1 and ";" in rows[0][0]:
+            raise ValueError("row 1 has semicolons between its columns, save it with commas")
+    yield from ([csv_text(cell) for cell in row] for row in rows if row)
 
 
 def read_rows(path: Path, *, remedy: str) -> Iterator[dict[str, str]]:
     """Rows of a CSV file with a header, by column; cells that a row lacks are empty, and further ones are left out.
 
-    The arguments and errors are those of :func:`read_table`; a column that occurs twice is an error, too.
+    Arguments and errors are as for :func:`read_table`; a column that occurs twice is an error, too.
     """
     rows = read_table(path, remedy=remedy)
     header = next(rows, [])
-    if twice := next((name for name, count in Counter(filter(None, header)).items() if count > 1), None):
-        raise FaceDiffError(f'{path}: has the column "{twice}" twice; {remedy}')
+    if columns := [name for name, count in Counter(filter(None, header)).items() if count > 1]:
+        raise FaceDiffError(f'{path}: has the column "{columns[0]}" twice; {remedy}')
     for row in rows:
         yield dict(zip(header, row + [""] * (len(header) - len(row)), strict=False))

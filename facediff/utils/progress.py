@@ -16,7 +16,7 @@ BETWEEN_LINES = 60.0
 
 
 def on_terminal() -> bool:
-    """Whether somebody sees a bar: both streams lead to a terminal, and neither to a file or another program."""
+    """Whether a bar is visible: both streams lead to a terminal, and neither to a file or another program."""
     return all(stream is not None and stream.isatty() for stream in (sys.stderr, sys.stdout))
 
 
@@ -65,17 +65,17 @@ def _lines(description: str, total: int | None, count: int) -> Callable[[], obje
 
     def step() -> None:
         nonlocal count, first, started, last
-        count, now = count + 1, time.monotonic()
+        count, clock = count + 1, time.monotonic()
         if math.isnan(started):  # what comes before the first step says nothing of their pace
-            first, started = count, now
-        if now - last < BETWEEN_LINES or count == total:
+            first, started = count, clock
+        if clock - last < BETWEEN_LINES or count == total:
             return
-        last = now
+        last = clock
         line = f"{description}: {count}"
         if total is not None:
             line += f" of {total}"
             if count > first:
-                line += f", {math.ceil((now - started) / (count - first) * (total - count) / 60)} min left"
+                line += f", {math.ceil((clock - started) / (count - first) * (total - count) / 60)} min left"
         print(line, file=sys.stderr, flush=True)
 
     return step

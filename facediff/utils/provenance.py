@@ -1,8 +1,8 @@
-"""What made a folder of scores or of predictions: ``provenance.json`` next to them.
+"""The origin of a folder of scores or of predictions: ``provenance.json`` next to them.
 
-Scores mean little without the training run that they are of. Whoever compares two folders reads here whether they are
-of two methods, or of one method that was trained twice: then their difference is chance between training runs, about
-which the spread over sentences says nothing.
+Scores mean little without their training run. The file tells whether two folders are of two methods, or of one method
+that was trained twice: then their difference is chance between training runs, about which the spread over sentences
+says nothing.
 
 A folder of predictions holds nothing but predictions, as other projects' scripts expect; its file lies next to it,
 ``<folder>.provenance.json``.
@@ -30,7 +30,7 @@ REMEDY = "expected what `facediff test` or `facediff predict` writes; remove the
 
 @dataclass(frozen=True)
 class Provenance:
-    """One training run, and what was scored or predicted with it.
+    """One training run, and the source of its scores or predictions.
 
     Attributes:
         model: the method's class.
@@ -39,7 +39,7 @@ class Provenance:
         seed: of the training run; None where the checkpoint does not know it, as an imported one.
         steps: optimiser steps of the training.
         checkpoint: SHA-256 of the checkpoint; empty if the model came from none.
-        corpus: what it was scored on.
+        corpus: of the scores.
         manifest: SHA-256 of that corpus's manifest, or ``none``.
         parameters: weights of the network, trained and frozen.
         versions: of facediff, torch and lightning.
@@ -56,9 +56,9 @@ class Provenance:
     parameters: int | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
-    def same_method(self, other: Provenance) -> bool:
+    def same_method(self, run: Provenance) -> bool:
         """Whether two runs are of one method, with equal options and equally many steps: they differ by chance."""
-        return bool(self.recipe) and (self.recipe, self.steps) == (other.recipe, other.steps)
+        return bool(self.recipe) and (self.recipe, self.steps) == (run.recipe, run.steps)
 
     def columns(self) -> dict[str, str]:
         """The run in three cells of a table of scores."""
@@ -96,7 +96,7 @@ def next_to(folder: Path) -> Path:
 
 
 def read_provenance(folder: Path) -> Provenance | None:
-    """What made a folder; None if it does not say, as folders of other projects do not."""
+    """The origin of a folder; None if it does not say, as folders of other projects do not."""
     path = next((path for path in (folder / FILE, next_to(folder)) if path.is_file()), None)
     return None if path is None else provenance_of(load_json(path, remedy=REMEDY), path)
 

@@ -1,7 +1,7 @@
 """The numbers that several commands and functions take, by name.
 
-Upper ends are far above what is useful, and low enough that nothing overflows and no machine is filled by a slip of the
-finger.
+Upper ends are far above useful values, and low enough that nothing overflows and no machine is filled by a
+mistyped number.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from facediff.utils.limits import FRAME_RATES
 
 BlinkRate = Annotated[float, Range(1, 40)]
 USUAL_BLINKS = 17.0
-"""Blinks a minute where no number is given: those of somebody at rest."""
+"""Blinks a minute of a person at rest, where no number is given."""
 Bound = Annotated[float, Range(-1000, 1000)]
 ChunkLength = Annotated[float, Range(0.01, 60)]
 ClipLength = Annotated[float, Range(1, 600)]

@@ -1,7 +1,7 @@
 """Plain data of a file (JSON or YAML) as a dataclass: the one check of plans, studies, answers and results.
 
-Type hints say what a file holds: ``Annotated[int, Range(0, 9)]``, ``Annotated[str, Text("[a-z]+")]``, tuples, mappings
-and further dataclasses. A value that does not fit is refused in one sentence that names the file and the field.
+Type hints state the content of a file: ``Annotated[int, Range(0, 9)]``, ``Annotated[str, Text("[a-z]+")]``, tuples,
+mappings and further dataclasses. A value that does not fit is refused in a sentence that names file and field.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Text:
 
     Attributes:
         pattern: that the whole text matches.
-        expected: what errors say instead of the pattern.
+        expected: words for the pattern in errors.
         longest: characters at most.
     """
 
@@ -119,24 +119,24 @@ class _Reader:
     def items(self, inner: tuple[Any, ...], value: list[Any], name: str) -> tuple[Any, ...]:
         """A tuple of a list: of equal items, or of as many as the hint has."""
         if len(inner) == 1 or inner[-1] is Ellipsis:
-            return tuple(self.read(inner[0], item, f"{name}[{place}]") for place, item in enumerate(value))
+            return tuple(self.read(inner[0], item, f"{name}[{index}]") for index, item in enumerate(value))
         if len(inner) != len(value):
             return self.refuse(name, value, f"a list of {len(inner)}")
-        return tuple(map(self.read, inner, value, [f"{name}[{place}]" for place in range(len(value))]))
+        return tuple(map(self.read, inner, value, [f"{name}[{index}]" for index in range(len(value))]))
 
     def record(self, kind: Any, content: Any, name: str) -> Any:  # noqa: ANN401 - a dataclass
         """A dataclass from a mapping."""
         content = {} if content is None else content
         if not isinstance(content, dict):
             return self.refuse(name or "the content", content, "fields with values")
-        known = _fields(kind)
+        fields_by_name = _fields(kind)
         prefix = f"{name}." if name else ""
-        if self.strict and (unknown := next((key for key in content if key not in known), None)) is not None:
-            shown = quoted(unknown) if not isinstance(unknown, str) else f'"{unknown}"'
+        if self.strict and (unknown := next((key for key in content if key not in fields_by_name), None)) is not None:
+            label = quoted(unknown) if not isinstance(unknown, str) else f'"{unknown}"'
             where = f"{self.source}: {name}" if name else f"{self.source}"
-            raise FaceDiffError(f"{where}: has no field {shown}: {choices(str(unknown), known)}")
+            raise FaceDiffError(f"{where}: has no field {label}: {choices(str(unknown), fields_by_name)}")
         values = {}
-        for key, (field, hint) in known.items():
+        for key, (field, hint) in fields_by_name.items():
             value = content.get(key)
             if value is None and (field.default is not MISSING or field.default_factory is not MISSING):
                 continue
@@ -144,7 +144,7 @@ class _Reader:
         return kind(**values)
 
     def refuse(self, name: str, value: object, expected: str) -> Any:  # noqa: ANN401 - never returns
-        """Say what does not fit."""
+        """Refuse a value that does not fit."""
         end = f"; {self.remedy}" if self.remedy else ""
         raise FaceDiffError(f"{self.source}: {name} is {quoted(value)}; expected {expected}{end}")
 

@@ -1,4 +1,4 @@
-"""Small servers of a page on this machine: bounded bodies, strict headers, and nobody else's pages let in.
+"""Small servers of a page on this machine: bounded bodies, strict headers, and no foreign pages.
 
 For the user study and for picking landmarks; both are ASGI applications of Starlette, run by uvicorn.
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-"""Names by which nobody but this machine reaches itself."""
+"""Names by which only this machine reaches itself."""
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -58,7 +58,7 @@ def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, pu
 
     Args:
         host: of the request, with its port.
-        origin: of the page whose script sends it; None if none does.
+        origin: of the page with the script that sends it; None if none does.
         hosts: names under which the page is served; None if any may be right, as where all addresses are listened at.
         public_name: name under which a web server in front offers the page, by HTTP or HTTPS; no other name but
             ``hosts`` and this is right then.
@@ -67,7 +67,7 @@ def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, pu
         >>> is_own_page("localhost:80", "http://localhost:80", LOOPBACK), is_own_page("evil.example", None, LOOPBACK)
         (True, False)
     """
-    own = {name.lower() for name in (*(hosts or LOOPBACK), *([public_name] if public_name else []))}
+    names = {name.lower() for name in (*(hosts or LOOPBACK), *([public_name] if public_name else []))}
     try:
         name, page = urlsplit(f"//{host}").hostname or "", urlsplit(origin or "")
         public = public_name is not None and page.scheme in ("http", "https") and page.hostname == public_name.lower()
@@ -75,7 +75,7 @@ def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, pu
         return False
     if origin is not None and not public and origin.lower() != f"http://{host.lower()}":
         return False
-    return (hosts is None and public_name is None) or name in own
+    return (hosts is None and public_name is None) or name in names
 
 
 class WithHeaders:
@@ -127,7 +127,7 @@ class OwnPagesOnly:
 async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
     """The object that a request holds.
 
-    Only JSON is taken: a page of another origin cannot send that without asking, and nobody tells it that it may.
+    Only JSON is taken: a page of another origin cannot send that without permission, which it never gets.
 
     Raises:
         RefusedError: if it is of another type or too large.
@@ -148,7 +148,7 @@ async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
 
 
 def own_page_only(hosts: Collection[str] | None, public_name: str | None = None) -> list[Middleware]:
-    """Middleware of an application: strict headers, and :class:`OwnPagesOnly`, whose arguments these are."""
+    """Middleware of an application: strict headers, and :class:`OwnPagesOnly`, which takes these arguments."""
     from starlette.middleware import Middleware
 
     return [Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts, public_name=public_name)]
@@ -158,7 +158,7 @@ def require_server(purpose: str, names: Collection[str] = ("starlette", "uvicorn
     """Refuse to begin where the server's packages are not installed.
 
     Args:
-        purpose: what they are needed for.
+        purpose: of the packages, in words.
         names: of the packages.
         extra: of facediff that brings them.
     """
@@ -200,11 +200,11 @@ def run_server(
         ) from error
     with listening:
         name, number = listening.getsockname()[:2]
-        shown = f"[{name}]" if ":" in name else name
+        address = f"[{name}]" if ":" in name else name
         config = uvicorn.Config(
             app, log_level="error", access_log=False, server_header=False, lifespan="off", ws="none"
         )
-        server = make_server(config, lambda: ready(f"http://{shown}:{number}/") if ready is not None else None)
+        server = make_server(config, lambda: ready(f"http://{address}:{number}/") if ready is not None else None)
         server.run(sockets=[listening])
     return bool(stopped)
 

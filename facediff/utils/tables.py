@@ -1,4 +1,4 @@
-"""Tables for the terminal and for pipes; :mod:`facediff.reporting` has those of documents."""
+"""Tables for the terminal and for pipes; :mod:`facediff.reporting` has tables for documents."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def print_table(
 ) -> None:
     """Print a table: with bold titles and within the width of a terminal, or as plain text in full anywhere else.
 
-    The arguments are those of :func:`format_table`; ``stream`` is standard output if None.
+    The arguments are as for :func:`format_table`; ``stream`` is standard output if None.
     """
     from rich.console import Console
     from rich.table import Table
@@ -49,8 +49,8 @@ def print_table(
     cells = [[Text("-" if cell is None else printable(cell)) for cell in row] for row in rows]
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=bool(head), header_style="bold")
     columns = head or [""] * max(map(len, cells), default=0)
-    for place, title in enumerate(columns):
-        table.add_column(Text(printable(title)), justify="left" if place < left else "right", overflow="fold")
+    for column, title in enumerate(columns):
+        table.add_column(Text(printable(title)), justify="left" if column < left else "right", overflow="fold")
     for row in cells:
         table.add_row(*row)
     console.print(table)

@@ -12,7 +12,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.arrays import read_arrays
 from facediff.utils.limits import brief
 
@@ -39,12 +39,10 @@ def load_tensors(file: str | os.PathLike[str] | IO[bytes], expected: str = EXPEC
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of how older versions stored tensors
             return torch.load(file, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise FaceDiffError(f"{file}: cannot be read ({error.strerror or error}); {expected}") from error
     except Exception as error:  # PyTorch's reasons are paragraphs with advice to read such a file all the same
         name = file if isinstance(file, str | os.PathLike) else getattr(file, "name", "checkpoint")
-        other = isinstance(error, pickle.UnpicklingError)
-        reason = "damaged, or more than tensors and plain values" if other else brief(error)
+        not_plain = isinstance(error, pickle.UnpicklingError)
+        reason = "damaged, or more than tensors and plain values" if not_plain else brief(error)
         raise FaceDiffError(f"{name}: not a checkpoint that can be loaded safely ({reason}); {expected}") from error
 
 
@@ -61,16 +59,12 @@ def read_safetensors(path: Path) -> dict[str, Tensor]:
     """The tensors of a file, on the CPU."""
     from safetensors.torch import load_file
 
-    try:
+    remedy = "copy or download it again, in a git clone by `git lfs pull`"
+    with damaged(f"{path}: not a readable safetensors file", remedy, Exception):
         return load_file(path)
-    except Exception as error:  # the library's own errors share no base class with those of reading
-        raise FaceDiffError(
-            f"{path}: not a readable safetensors file ({brief(error)}); copy or download it again, in a git clone by "
-            f"`git lfs pull`"
-        ) from error
 
 
-# Checkpoints of other projects: their tensors alone, whatever else the file holds.
+# Checkpoints of other projects: their tensors alone.
 
 
 class Foreign:

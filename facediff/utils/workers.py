@@ -1,6 +1,6 @@
 """Worker processes and threads of this machine: how they start, do tasks one by one, and end.
 
-:func:`facediff.utils.jobs.run_tasks` is what the rest of the package calls.
+The rest of the package calls :func:`facediff.utils.jobs.run_tasks`.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ def run_locally(
         for task in tasks:
             yield task, work(task)
     else:
-        waiting = deque(tasks)
-        while waiting:
+        queue = deque(tasks)
+        while queue:
             suspects: deque[Task] = deque()
-            workers = min(workers, len(waiting))
-            yield from _together(process_pool(work, workers), _do, waiting, workers, suspects)
+            workers = min(workers, len(queue))
+            yield from _together(process_pool(work, workers), _do, queue, workers, suspects)
             # One of these tasks killed its process and thereby the whole pool; one at a time it is known which.
             while suspects:
                 guilty: deque[Task] = deque()
@@ -66,22 +66,22 @@ def run_locally(
 
 
 def _together(
-    pool: Executor, work: Callable[[Task], Result], waiting: deque[Task], workers: int, suspects: deque[Task]
+    pool: Executor, work: Callable[[Task], Result], queue: deque[Task], workers: int, suspects: deque[Task]
 ) -> Iterator[tuple[Task, Result]]:
-    """Results until all tasks are done, or until a process dies: then what was running goes to ``suspects``."""
+    """Results until all tasks are done, or until a process dies: then running tasks go to ``suspects``."""
     running: dict[Future[Result], Task] = {}
     try:
-        while waiting or running:
-            while waiting and len(running) < workers:
+        while queue or running:
+            while queue and len(running) < workers:
                 with starting_processes() if isinstance(pool, ProcessPoolExecutor) else nullcontext():
-                    running[pool.submit(work, waiting[0])] = waiting[0]
-                waiting.popleft()
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            _raise_first_error(running, done)
-            for future in done:
+                    running[pool.submit(work, queue[0])] = queue[0]
+                queue.popleft()
+            complete, _ = wait(running, return_when=FIRST_COMPLETED)
+            _raise_first_error(running, complete)
+            for future in complete:
                 if not isinstance(future.exception(), BrokenProcessPool):
                     yield running.pop(future), future.result()
-            if done & running.keys():
+            if complete & running.keys():
                 raise BrokenProcessPool
     except BrokenProcessPool:
         suspects += running.values()
@@ -92,18 +92,18 @@ def _together(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _raise_first_error(running: Collection[Future[Any]], done: Collection[Future[Any]]) -> None:
+def _raise_first_error(running: Collection[Future[Any]], complete: Collection[Future[Any]]) -> None:
     """Raise the error of the first task that failed, in the order of the tasks, and not of the quickest to fail."""
-    for place, future in enumerate(running):
-        if future in done and isinstance(future.exception(), Exception):
-            wait(list(running)[: place + 1])
-            for earlier in list(running)[: place + 1]:
+    for index, future in enumerate(running):
+        if future in complete and isinstance(future.exception(), Exception):
+            wait(list(running)[: index + 1])
+            for earlier in list(running)[: index + 1]:
                 if not isinstance(earlier.exception(), BrokenProcessPool):
                     earlier.result()
 
 
 def end_soon(pool: Executor, running: Collection[Future[Any]]) -> None:
-    """Let what is running come to its end for some seconds, then end the processes; Ctrl-C again ends them."""
+    """Let running tasks come to their end for some seconds, then end the processes; Ctrl-C again ends them."""
     processes = list((getattr(pool, "_processes", None) or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
     try:
@@ -125,7 +125,7 @@ _work: Callable[[Any], Any] | None = None
 
 def process_pool(work: Callable[[Any], Any] | None, workers: int) -> ProcessPoolExecutor:
     """Worker processes, to be started by :func:`starting_processes`."""
-    # Never a plain fork: the caller may have started threads, those of torch for instance.
+    # Never a plain fork: the caller may have started threads, such as torch's.
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(work,))
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import yaml
 
-from facediff.errors import FaceDiffError
-from facediff.utils.limits import brief, quoted
+from facediff.errors import FaceDiffError, damaged
+from facediff.utils.limits import quoted
 
 
 def load_yaml(path: Path, remedy: str) -> dict[str, Any]:
@@ -20,10 +20,8 @@ def load_yaml(path: Path, remedy: str) -> dict[str, Any]:
     """
     text = yaml_text(path, remedy)
     check_yaml(text, path)
-    try:
+    with damaged(f"{path}: is not readable as YAML", remedy, yaml.YAMLError):  # a list as a key, say
         content = yaml.load(text, Loader=_Plain)  # noqa: S506 - a safe loader that knows fewer types
-    except (yaml.YAMLError, TypeError, ValueError) as error:  # a list as a key, say
-        raise FaceDiffError(f"{path}: is not readable as YAML ({brief(error)}); {remedy}") from error
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise FaceDiffError(f"{path}: holds {quoted(content)}, expected a mapping (key: value); {remedy}")
     return content
@@ -40,31 +38,25 @@ class _Plain(yaml.SafeLoader):
 
 def yaml_text(path: Path | str, remedy: str) -> str:
     """The text of a YAML file; ``remedy`` is how messages end."""
-    try:
+    with damaged(f"{path}: not readable as UTF-8", remedy, OSError):
         return Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
-    except UnicodeDecodeError as error:
-        raise FaceDiffError(f"{path}: is not UTF-8 (byte {error.start}); save it as UTF-8. Also {remedy}") from error
 
 
 def check_yaml(text: str, source: object) -> None:
     """Refuse a YAML text that cannot be parsed or gives a key twice, of which YAML's parsers take the last silently."""
-    try:
-        waiting, seen = [yaml.compose(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))], set[int]()
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise FaceDiffError(f"{source}: is not readable as YAML ({brief(error)}); correct the line") from error
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen or not isinstance(node, yaml.CollectionNode):
+    with damaged(f"{source}: is not readable as YAML", "correct the line", yaml.YAMLError, RecursionError):
+        nodes, visited = [yaml.compose(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))], set[int]()
+    while nodes:
+        node = nodes.pop()
+        if id(node) in visited or not isinstance(node, yaml.CollectionNode):
             continue
-        seen.add(id(node))  # an alias is the node that it names
+        visited.add(id(node))  # an alias is the node that it names
         if isinstance(node, yaml.SequenceNode):
-            waiting += node.value
+            nodes += node.value
             continue
         keys = set[str]()
         for key, value in node.value:
-            waiting += (key, value)
+            nodes += (key, value)
             if not isinstance(key, yaml.ScalarNode):
                 continue
             if key.value in keys and key.value != "<<":

@@ -32,7 +32,7 @@ from facediff.reporting.documents import markdown
 from tests.benchmark.conftest import PLAN
 from tests.fakes.waiting import wait_until
 
-LAUNCHER = (sys.executable, "-m", "facediff.utils.tethered", "tests.fakes.stand_in")
+LAUNCHER = (sys.executable, "-m", "facediff.benchmark.exit_with_parent", "tests.fakes.stand_in")
 ONE_SEED = PLAN.replace("[0, 1]", "[0]")
 
 

@@ -14,7 +14,7 @@ import torch
 
 from facediff.cli.app import main
 from facediff.data import collate
-from facediff.data.prepare.runner import write_templates
+from facediff.data.preparation import write_templates
 from facediff.models import load_model
 from facediff.models.adaptation import grow
 from facediff.models.audio_distillation import encoder_weights

@@ -262,7 +262,7 @@ def test_a_recording_is_not_replaced(
     capsys.readouterr()
     for words in ([videos[0], "-o", videos[0]], [*videos, "-o", folder]):
         assert animate(*words, "--checkpoint", checkpoint) == 2
-        assert "a.mp4: is read by this command" in capsys.readouterr().err
+        assert "a.mp4: would be overwritten, but this command reads" in capsys.readouterr().err
     assert [path.read_bytes() for path in videos] == before
     assert sorted(folder.iterdir()) == videos
 

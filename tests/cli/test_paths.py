@@ -16,9 +16,9 @@ from facediff.cli.options import FileOrList, Folder, Map, Output
 from facediff.cli.parsing import Parameters, flat, parameters_of, parse
 from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError
-from facediff.utils.destinations import reading
 from facediff.utils.files import atomic, atomic_folder, put_in_place
 from facediff.utils.option import Option
+from facediff.utils.output_paths import reading
 
 # Its outputs lie in folders of runs with numbers of their own, and `--ckpt_path last` replaces what it reads.
 LIGHTNING = {"fit", "validate", "test", "predict"}
@@ -185,7 +185,7 @@ def test_an_input_within_a_text_is_found(tmp_path: Path) -> None:
     file = tmp_path / "a.npy"
     file.touch()
     for text in (f"NAME={file}", f"{file}:0.3,x:0.7", f"x:0.3,{file}:0.7", f"{file}:lips", f"{file}>0.1"):
-        with pytest.raises(FaceDiffError, match="is read by this command"):
+        with pytest.raises(FaceDiffError, match="would be overwritten, but this command reads"):
             check("x", "--method", text, "-o", file)
 
 
@@ -202,7 +202,7 @@ def test_data_of_a_folder_that_is_read_is_not_replaced_but_results_in_it_are(tmp
     for name in ("a.npy", "manifest.json", "scores.csv"):
         (tmp_path / name).touch()
     for name in ("a.npy", "manifest.json"):
-        with pytest.raises(FaceDiffError, match="which is read by this command"):
+        with pytest.raises(FaceDiffError, match="this command reads"):
             check("x", "--folder", tmp_path, "-o", tmp_path / name)
     check("x", "--folder", tmp_path, "-o", tmp_path / "scores.csv")
     check("x", "--folder", tmp_path, "-o", tmp_path / "new.npy")
@@ -233,12 +233,12 @@ def test_what_is_read_stays_under_every_later_name(tmp_path: Path) -> None:
     file.parent.mkdir()
     file.write_text("precious")
     with reading([file]):
-        with pytest.raises(FaceDiffError, match="is read"), atomic(file) as temporary:
+        with pytest.raises(FaceDiffError, match="this command reads"), atomic(file) as temporary:
             temporary.touch()
         (tmp_path / "new").touch()
-        with pytest.raises(FaceDiffError, match="is read"):
+        with pytest.raises(FaceDiffError, match="this command reads"):
             put_in_place(tmp_path / "new", file)
-        with pytest.raises(FaceDiffError, match="is read"), atomic_folder(file.parent, replace=True):
+        with pytest.raises(FaceDiffError, match="this command reads"), atomic_folder(file.parent, replace=True):
             pass
     assert file.read_text() == "precious"
     with atomic(file) as temporary:

@@ -41,4 +41,4 @@ def test_json_is_written_without_numbers_that_it_does_not_know() -> None:
         if all(word.arg != "allow_nan" for word in call.keywords)
     ]
     # What is parsed again in the same process, or compared only.
-    assert {entry.partition(":")[0] for entry in loose} == {"lightning.py", "runner.py", "folder.py"}
+    assert {entry.partition(":")[0] for entry in loose} == {"lightning.py", "preparation.py", "folder.py"}

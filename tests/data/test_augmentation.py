@@ -13,14 +13,12 @@ from facediff.data.augmentation import (
     Augmentation,
     Augmenter,
     Example,
-    filtered,
     read_augmentations,
     vorbis,
     warped,
 )
 from facediff.errors import FaceDiffError
 from facediff.registry import augmentation
-from facediff.speech.pitch import signal, spectra
 
 RATE = 16_000
 NAMES = augmentation.names()
@@ -74,12 +72,6 @@ def test_share_is_that_of_clips_and_the_others_stay_as_they_are() -> None:
     made = [Augmenter([only("tilt:share=0.5")], 0.6)(given, seed).speech for seed in range(300)]
     changed = np.mean([speech is not given.speech and not np.array_equal(speech, given.speech) for speech in made])
     assert 0.2 < changed < 0.4
-
-
-def test_spectra_give_the_signal_back() -> None:
-    speech = example().speech
-    np.testing.assert_allclose(signal(spectra(speech), len(speech))[128:], speech[128:], atol=1e-5)
-    np.testing.assert_allclose(filtered(speech, lambda hertz: 0 * hertz + 2), 2 * speech, atol=1e-6)
 
 
 @pytest.mark.parametrize("ratio", [0.85, 1.2])

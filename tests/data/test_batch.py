@@ -17,7 +17,7 @@ from facediff.export import write_animations
 from facediff.pipelines.trained import facts_of
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.glb_reader import Reader
-from tests.fakes.tiny import Tiny, write_tiny
+from tests.fakes.tiny import Tiny
 
 
 def test_a_batch_pads_with_zeros_and_says_what_is_valid(tiny: Tiny) -> None:
@@ -66,13 +66,6 @@ def test_speakers_take_their_own_colours_through_a_checkpoint_into_exports(tiny:
     # Checkpoints that were written before speakers had colours have no such entry.
     del state["identity_colours"]
     assert facts_of(Assets.from_state(state), "B")["colours"] is None
-
-
-def test_colours_that_do_not_fit_name_their_file(tmp_path: Path) -> None:
-    root = write_tiny(tmp_path / "tiny")
-    np.savez(root / "colours.npz", A=np.zeros((5, 3), np.uint8))
-    with pytest.raises(FaceDiffError, match="colours.npz"):
-        Tiny(root=str(root)).assets()
 
 
 def test_assets_of_channels_survive_a_checkpoint_and_refuse_what_does_not_fit(tmp_path: Path) -> None:

@@ -86,16 +86,6 @@ def test_a_missing_folder_says_how_the_corpus_is_had(tmp_path: Path) -> None:
             _ = module(root=str(tmp_path / "nowhere")).corpus
 
 
-def test_a_missing_relative_folder_is_looked_for_in_the_working_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(FaceDiffError, match=rf"^VOCA: no such folder; .*working folder, {tmp_path}; set data\.root"):
-        _ = Vocaset(root="VOCA").corpus
-    with pytest.raises(FaceDiffError, match=rf"data\.people: maria: no such folder; .*{tmp_path}"):
-        Vocaset(root="VOCA", people=["maria"])
-
-
 def write_person(root: Path, name: str = "Ada") -> Path:
     write(root, [f"{name}_s{i:02d}" for i in range(1, 5)], {name})
     rows = [f"{name}_s{i:02d},{split}" for i, split in enumerate(["train", "train", "val", "test"], 1)]

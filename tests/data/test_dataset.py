@@ -163,25 +163,6 @@ def broken(tmp_path: Path) -> Path:
     return write_tiny(tmp_path / "broken")
 
 
-def test_nan_names_the_file_and_the_frame(broken: Path) -> None:
-    path = broken / "vertices_npy" / "A_e01.npy"
-    array = np.load(path)
-    array[3, 5] = np.nan
-    np.save(path, array)
-    with pytest.raises(FaceDiffError, match=r"A_e01\.npy: frame 3 holds NaN"):
-        Tiny(root=str(broken)).dataset("train")[0]
-
-
-def test_wrong_vertex_count_and_truncated_file(broken: Path) -> None:
-    path = broken / "vertices_npy" / "A_e01.npy"
-    np.save(path, np.zeros((4, 30), np.float32))
-    with pytest.raises(FaceDiffError, match=r"A_e01\.npy: has shape \(4, 30\), expected \(frames, 72\)"):
-        Tiny(root=str(broken)).dataset("train")[0]
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(FaceDiffError, match=r"A_e01\.npy: not a readable NumPy array"):
-        Tiny(root=str(broken)).dataset("train")[0]
-
-
 def test_newcomers_train_on_their_clips_of_no_split(tiny_root: Path) -> None:
     data = Tiny(root=str(tiny_root), extra_identities=["C"])
     assert data.identities == ["C", "A", "B"]
@@ -191,5 +172,5 @@ def test_newcomers_train_on_their_clips_of_no_split(tiny_root: Path) -> None:
     assert {clip.identity for clip in only.clips("train")} == {"C"}
     assert only.identities == data.identities
     assert [clip.name for clip in only.clips("val")] == [clip.name for clip in data.clips("val")]
-    with pytest.raises(FaceDiffError, match="A is there more than once"):
+    with pytest.raises(FaceDiffError, match="A occurs more than once"):
         Tiny(root=str(tiny_root), extra_identities=["A"])

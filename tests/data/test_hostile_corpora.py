@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from facediff.data.corpus import Corpus, read_clip_table, read_templates
-from facediff.data.prepare.motion import read_parameters
+from facediff.data.reconstructions import read_parameters
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import quoted
-from tests.speech.test_audio import wave
 
 FACE = np.random.default_rng(0).normal(size=(9, 3))
 
@@ -84,15 +83,6 @@ def test_clip_table_with_a_damaged_row_is_refused(content: bytes, tmp_path: Path
 def test_clip_table_of_a_spreadsheet_is_read(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "clips.csv").write_bytes(content)
     assert read_clip_table(tmp_path) == {"A_01": {"mood": "sad"}}
-
-
-def corpus(root: Path, clip: str = "A_01") -> Corpus:
-    for folder in ("wav", "vertices_npy"):
-        (root / folder).mkdir(parents=True, exist_ok=True)
-    (root / "wav" / f"{clip}.wav").write_bytes(wave(body=bytes(32_000)))
-    np.save(root / "vertices_npy" / f"{clip}.npy", np.tile(FACE.ravel(), (25, 1)).astype(np.float32))
-    (root / "templates.pkl").write_bytes(pickle.dumps({"A": FACE}))
-    return Corpus(root, 9, 25.0)
 
 
 def test_parameters_that_lie_in_another_file_are_refused(tmp_path: Path) -> None:

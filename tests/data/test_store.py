@@ -145,13 +145,6 @@ def test_sound_keeps_its_time_beside_the_picture(tmp_path: Path, suffix: str, so
     assert heard == pytest.approx(0.5 + sound - picture, abs=0.07)  # AAC spreads an onset over its frame of 0.064 s
 
 
-@pytest.mark.parametrize(("content", "sentence"), [(b"text" * 99, "cannot be read"), (b"", "an empty one")])
-def test_a_broken_video_is_one_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
-    (tmp_path / "v.flv").write_bytes(content)
-    with pytest.raises(FaceDiffError, match=rf"v\.flv: .*{sentence}"):
-        read_speech(tmp_path / "v.flv")
-
-
 def test_a_video_without_sound(tmp_path: Path) -> None:
     import av
 

@@ -61,7 +61,7 @@ class DaskProcesses:
         search = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
         with (self.folder / f"log{len(self.programs)}.txt").open("wb") as log:
             program = subprocess.Popen(
-                [sys.executable, "-m", "facediff.utils.tethered", "dask", *words],
+                [sys.executable, "-m", "facediff.benchmark.exit_with_parent", "dask", *words],
                 cwd=self.folder,
                 env={**os.environ, "PYTHONPATH": search},
                 stdin=subprocess.PIPE,  # which ends it with this process

@@ -329,7 +329,7 @@ def test_a_hostile_model_is_refused_and_does_not_run(protocol: int, tmp_path: Pa
     mark = tmp_path / "mark"
     hostile = pickle.dumps({**flame_arrays(8), "weights": Bomb(mark)}, protocol)
     (tmp_path / "m.pkl").write_bytes(hostile)
-    with pytest.raises(FaceDiffError, match=r"m\.pkl: not a pickle of plain NumPy arrays \(it asks for posix\.mkdir\)"):
+    with pytest.raises(FaceDiffError, match=r"m\.pkl: not a pickle of plain NumPy arrays: it asks for posix\.mkdir"):
         Flame.read(tmp_path / "m.pkl")
     assert not mark.exists()
     pickle.loads(hostile)  # noqa: S301 - it would have run

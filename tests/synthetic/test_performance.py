@@ -8,7 +8,7 @@ import pytest
 from facediff.speech.espeak import SpokenPhoneme
 from facediff.synthetic.articulation import speech_sounds
 from facediff.synthetic.head.rig import SHAPES
-from facediff.synthetic.performance import MOODS, FaceMotion, SpeakingHabits, perform
+from facediff.synthetic.performance import MOODS, FaceMotion, SpeakingHabits, synthesise_motion
 from facediff.synthetic.prosody import ProsodyContours
 
 RATE = 100.0
@@ -22,7 +22,7 @@ def performance(seconds: float = 60.0, seed: int = 0, mood: str = "neutral", **h
     contours = ProsodyContours(times, melody, melody)
     frames = int(seconds * RATE)
     random = np.random.default_rng(seed)
-    return perform(speech_sounds(phonemes), contours, frames, RATE, SpeakingHabits(**habits), mood, random)
+    return synthesise_motion(speech_sounds(phonemes), contours, frames, RATE, SpeakingHabits(**habits), mood, random)
 
 
 def column(motion: FaceMotion, name: str) -> np.ndarray:

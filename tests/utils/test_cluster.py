@@ -16,7 +16,7 @@ import pytest
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils import cluster, jobs
 from facediff.utils.batch import run_batch
-from facediff.utils.jobs import PerWorker, SetupError, check_scheduler, run_tasks
+from facediff.utils.jobs import PerWorker, SetupError, run_tasks
 from facediff.utils.workers import WorkerDied
 from tests.fakes.tasks import counting, deadly, failing_oddly, failing_setup, place, raising, square, write_slowly
 from tests.fakes.waiting import wait_until
@@ -131,15 +131,6 @@ def test_workers_of_another_version_or_without_the_folder_refuse(field: str, val
     assert value in cluster.problem(replace(run, **{field: value}))
 
 
-@pytest.mark.parametrize(
-    ("where", "named"),
-    [("tcp://", "tcp://"), ("dask", "dask"), ("", "--scheduler"), ("processess", "processess"), ("tcp:/a:1", "tcp:/a")],
-)
-def test_what_is_no_place_for_tasks_is_refused(where: str, named: str) -> None:
-    with pytest.raises(FaceDiffError, match=named):
-        check_scheduler(where)
-
-
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "CONNECTING", 0.3)
     with pytest.raises(FaceDiffError, match="tcp://127.0.0.1:9"):
@@ -154,13 +145,6 @@ def test_a_cluster_without_workers_is_given_up(monkeypatch: pytest.MonkeyPatch) 
         pytest.raises(FaceDiffError, match="worker"),
     ):
         list(run_tasks(place, [0], scheduler=empty.scheduler_address))
-
-
-@pytest.mark.parametrize("where", ["tcp://host:1", "slurm:cores=1"])
-def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
-    monkeypatch.setattr(jobs.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(MissingExtraError, match="cluster"):
-        check_scheduler(where)
 
 
 def test_nothing_imports_dask_unless_a_cluster_is_asked_for() -> None:
@@ -207,18 +191,6 @@ def test_slurm_options_make_the_job_script(slurm: Path) -> None:
     jobs = slurm / "jobs"
     wait_until(lambda: jobs.exists() and len(jobs.read_text().split()) == 2)  # six workers of four a job
     assert re.sub(r"SLURMCluster-\d", "dummy-name", (slurm / "job.sh").read_text()) == script
-
-
-@pytest.mark.parametrize("options", ["", "cores=2", "cors=2,memory=1GB"])
-def test_wrong_slurm_options_are_refused(slurm: Path, options: str) -> None:
-    with pytest.raises(FaceDiffError, match="--scheduler slurm"):
-        list(run_tasks(place, [0], scheduler=f"slurm:{options}"))
-
-
-def test_without_slurm_its_program_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster.shutil, "which", lambda _: None)
-    with pytest.raises(FaceDiffError, match="sbatch"):
-        list(run_tasks(place, [0], scheduler="slurm:cores=1,memory=1GB"))
 
 
 def test_a_job_that_slurm_refuses_is_an_error(slurm: Path) -> None:

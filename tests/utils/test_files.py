@@ -9,14 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import soundfile
-import trimesh
 
 from facediff.errors import FaceDiffError
-from facediff.mesh import read_mesh
-from facediff.speech.audio import read_speech
 from facediff.utils.checksums import describe_files, same_sizes, sha256
 from facediff.utils.files import (
     atomic,
@@ -29,48 +24,8 @@ from facediff.utils.files import (
     scratch_folder,
 )
 from facediff.utils.plain_files import read_json, write_json, write_rows
-from facediff.utils.tables import format_table
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.mark.parametrize(
-    ("rate", "channels", "suffix"),
-    [(16000, 1, "wav"), (44100, 2, "wav"), (22050, 1, "flac"), (48000, 2, "ogg"), (24000, 1, "mp3")],
-)
-def test_any_sound_file_becomes_16_khz_mono(tmp_path: Path, rate: int, channels: int, suffix: str) -> None:
-    time = np.arange(rate) / rate
-    tone = 0.5 * np.sin(2 * np.pi * 440 * time)
-    path = tmp_path / f"tone.{suffix}"
-    soundfile.write(path, np.stack([tone] * channels, 1), rate)
-    speech = read_speech(path)
-    assert speech.dtype == np.float32
-    assert len(speech) == pytest.approx(16000, abs=1200 if suffix == "mp3" else 2)
-    spectrum = np.abs(np.fft.rfft(speech[2000:14000]))
-    assert np.argmax(spectrum) * 16000 / 12000 == pytest.approx(440, abs=2)
-    assert np.abs(speech[4000:12000]).max() == pytest.approx(0.5, abs=0.03)
-
-
-def test_stereo_is_averaged(tmp_path: Path) -> None:
-    left = np.linspace(-0.5, 0.5, 1600)
-    soundfile.write(tmp_path / "a.wav", np.stack([left, -left / 2], 1), 16000, subtype="FLOAT")
-    np.testing.assert_allclose(read_speech(tmp_path / "a.wav"), left / 4, atol=1e-7)
-
-
-@pytest.mark.parametrize("suffix", ["ply", "obj"])
-def test_a_mesh_keeps_its_vertex_order_and_duplicates(tmp_path: Path, suffix: str) -> None:
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 1, 0]], float)
-    faces = np.array([[0, 1, 2], [3, 1, 4]])
-    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / f"m.{suffix}")
-    mesh = read_mesh(tmp_path / f"m.{suffix}")
-    np.testing.assert_allclose(mesh.vertices, vertices)
-    assert np.array_equal(mesh.faces, faces)
-
-
-def test_a_mesh_without_faces(tmp_path: Path) -> None:
-    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
-    with pytest.raises(FaceDiffError, match=r"points\.obj"):
-        read_mesh(tmp_path / "points.obj")
 
 
 def test_an_atomic_file_is_whole_or_absent(tmp_path: Path) -> None:
@@ -91,22 +46,6 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
         check_writable(tmp_path / "file" / "out.npy")
     check_writable(tmp_path / "a" / "b" / "out.npy")
     assert not (tmp_path / "a").exists()
-
-
-def test_an_obj_keeps_vertices_that_no_face_uses_and_its_colours(tmp_path: Path) -> None:
-    """As textured scans have them; a mesh library that drops them would shift all that follow."""
-    (tmp_path / "m.obj").write_text(
-        "vt 0 0\nv 0 0 0 1 0 0\nv 9 9 9 0 1 0\nv 1 0 0 0 0 1\nv 0 1 0 0.5 0.5 0.5\nf 1/1 3/1 4/1\nf -4//1 -2//1 -1//1\n"
-    )
-    mesh = read_mesh(tmp_path / "m.obj")
-    assert mesh.vertices.tolist() == [[0, 0, 0], [9, 9, 9], [1, 0, 0], [0, 1, 0]]
-    assert mesh.faces.tolist() == [[0, 2, 3], [0, 2, 3]]
-    assert mesh.colours is not None
-    assert mesh.colours.tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]]
-    (tmp_path / "m.obj").write_text("v 0 0 0 255 51 0\nv 1 0 0 0 0 1\nv 0 1 0 0 0 0\nf 1 2 3\n")  # in bytes
-    colours = read_mesh(tmp_path / "m.obj").colours
-    assert colours is not None
-    assert colours.tolist() == [[255, 51, 0], [0, 0, 1], [0, 0, 0]]
 
 
 def test_an_atomic_folder_is_whole_or_absent(tmp_path: Path) -> None:
@@ -146,14 +85,6 @@ def test_an_atomic_folder_handles_a_folder_that_appears_meanwhile(tmp_path: Path
         (folder / "a").touch()
         (path / "other").touch()
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
-
-
-def test_errors_in_an_atomic_folder_name_the_final_path(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError) as caught, atomic_folder(tmp_path / "out") as folder:  # noqa: PT012
-        (folder / "file").touch()
-        check_writable(folder / "file" / "below")
-    assert str(tmp_path / "out" / "file" / "below") in str(caught.value)
-    assert "partial" not in str(caught.value)
 
 
 def test_the_scratch_folder_of_a_killed_process_is_removed_and_of_a_running_one_kept(tmp_path: Path) -> None:
@@ -198,13 +129,6 @@ def test_described_files_are_compared_by_size(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("clip")
     assert not same_sizes(tmp_path, files)
     assert not same_sizes(tmp_path, {"none": {"bytes": 1}})
-
-
-def test_names_do_nothing_to_a_terminal() -> None:
-    name = "clip\x1b]0;x\x07\x1b[2J\r\n\u202egpj\udcff\x9b"
-    shown = "\n".join([str(FaceDiffError(f"{name}: no such file")), format_table([name], [[name], [name]])])
-    assert len(shown.splitlines()) == 4
-    assert all(letter.isprintable() for line in shown.splitlines() for letter in line)
 
 
 def write(path: Path, text: str = "new") -> None:
@@ -333,23 +257,6 @@ def test_a_folder_that_may_not_be_written_is_refused_before_a_writer_has_its_own
     monkeypatch.setattr(os, "access", lambda path, mode: not (Path(path) == tmp_path and mode == os.W_OK))
     with pytest.raises(FaceDiffError, match=r"a\.yaml"), atomic(tmp_path / "a.yaml"):
         raise TypeError("path is not creatable")
-
-
-@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
-def test_no_json_holds_numbers_that_json_does_not_know(number: float, tmp_path: Path) -> None:
-    path = tmp_path / "report.json"
-    write_json(path, {"rate": 1.0})
-    with pytest.raises(FaceDiffError, match="report.json"):
-        write_json(path, {"rates": [{"rate": number}]})
-    assert path.read_text() == '{\n "rate": 1.0\n}\n'
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_checksum_of_what_cannot_be_read_names_it(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match="gone"):
-        sha256(tmp_path / "gone")
-    with pytest.raises(FaceDiffError, match=tmp_path.name):
-        sha256(tmp_path)
 
 
 @pytest.mark.parametrize("folder", [False, True])

@@ -37,7 +37,6 @@ for function, *words in json.loads(sys.argv[1]):
     except FaceDiffError as error:
         print(json.dumps(["error", str(error)]))
 """
-ENDLESS = b'HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n\r\n{"a": "'
 CARD_TEXT = b"---\nlicense: mit\n---\n# A face\n"
 
 
@@ -160,11 +159,6 @@ def test_a_path_of_this_machine_comes_first(tmp_path: Path, monkeypatch: pytest.
     (tmp_path / "ada" / "face" / WEIGHTS).unlink()
     with pytest.raises(FaceDiffError, match=WEIGHTS):
         check_model_source("ada/face", "--checkpoint")
-
-
-def test_what_is_not_there_is_named_with_its_option() -> None:
-    with pytest.raises(FaceDiffError, match="--checkpoint demo/none.ckpt"):
-        check_model_source("demo/none.ckpt", "--checkpoint")
 
 
 def test_a_models_hash_is_of_what_it_makes_and_not_of_its_card(tmp_path: Path) -> None:

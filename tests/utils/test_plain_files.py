@@ -50,13 +50,6 @@ def test_json_of_every_unicode_encoding_is_read(encoding: str) -> None:
     assert parse_json(text.encode(encoding), "here") == expected
 
 
-def test_json_of_what_is_no_file_is_refused(tmp_path: Path) -> None:
-    for name in ("none.json", "folder.json"):
-        (tmp_path / "folder.json").mkdir(exist_ok=True)
-        with pytest.raises(FaceDiffError, match=name):
-            load_json(tmp_path / name)
-
-
 def test_json_is_parsed_in_one_place() -> None:
     """A second parser would have its own ideas of NaN, nesting and encodings."""
     # These read what another part of the same process, or a process that it has started, wrote; Blender runs the last,

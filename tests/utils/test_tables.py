@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from facediff.utils.progress import progress_bar, track
 from facediff.utils.tables import format_table, print_table
 
 ROOT = Path(__file__).parents[2]
@@ -48,14 +47,6 @@ def test_a_table_fits_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     print_table(["name", "value"], [["b" * 100, "1"]], stream=stream)
     assert "\x1b[1m" in stream.getvalue()
     assert stream.getvalue().count("b") == 100
-
-
-def test_a_progress_bar_is_silent_without_a_terminal(capfd: pytest.CaptureFixture[str]) -> None:
-    with progress_bar("clips", 3) as step:
-        step()
-    assert list(track(iter("abc"), "letters", total=3)) == ["a", "b", "c"]
-    assert list(track("abc", "letters", shown=False)) == ["a", "b", "c"]
-    assert capfd.readouterr() == ("", "")
 
 
 def test_a_progress_bar_shows_on_a_terminal_and_leaves_standard_output_alone() -> None:

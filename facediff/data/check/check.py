@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from facediff.data.check.clip import LENGTHS, ClipFacts, ClipFiles, Rules, examine, is_about
+from facediff.data.check.clip import LENGTHS, ClipFiles, ClipInfo, Rules, examine, is_about
 from facediff.data.check.layouts import (
     MANIFEST,
     SPLITS,
@@ -21,7 +21,7 @@ from facediff.data.check.layouts import (
     is_rate,
     list_folder,
     list_packed,
-    read_record,
+    manifest_in,
 )
 from facediff.data.check.packed import check_packed, examine_packed
 from facediff.data.check.recordings import check_recordings, parametric_module, refuse_layout
@@ -84,13 +84,11 @@ def check(
     root = Path(root).expanduser() if packed is None else packed.folder
     if not root.is_dir():
         raise FaceDiffError(f"{root}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
-    if workers is not None and workers < 1:
-        raise FaceDiffError(f"--workers: is {workers}; expected 1 or more")
     from facediff.data.corpus import MOTION_FOLDERS
 
     report = CheckReport(source, quick)
-    manifest = read_record(root, MANIFEST, report.findings)
-    state = read_record(root, STATE, report.findings)
+    manifest = manifest_in(root, MANIFEST, report.findings)
+    state = manifest_in(root, STATE, report.findings)
     refuse_layout(corpus)
     module = parametric_module(root, corpus, manifest) if packed is None else None
     if module is not None:
@@ -111,7 +109,7 @@ def check(
         if packed is None:
             size = sum(path.stat().st_size for path in folder.motions.values() if path.is_file())
         else:
-            size = sum(sum(facts.shards) for facts in packed.record.arrays.values())
+            size = sum(sum(array.shards) for array in packed.record.arrays.values())
         if not is_cluster(scheduler):
             workers = workers or (1 if quick or size <= WORTH_IT else processors())
         examine_all = partial(_examine_all, workers=workers, scheduler=scheduler, progress=progress)
@@ -125,7 +123,7 @@ def _check_corpus(
     view: CorpusView,
     folder: CorpusFolder,
     manifest: dict[str, Any],
-    examine_all: Callable[[Rules, CorpusView, CorpusFolder], list[ClipFacts]],
+    examine_all: Callable[[Rules, CorpusView, CorpusFolder], list[ClipInfo]],
 ) -> None:
     from facediff.data.corpus import Corpus
 
@@ -200,34 +198,34 @@ def _clips(opened: Corpus | None, view: CorpusView, folder: CorpusFolder, findin
             clips = {name: read.get(name, clip) for name, clip in clips.items()}
             from facediff.data.corpus import read_clip_table
 
-            if strangers := sorted(set(read_clip_table(folder.root)) - set(folder.names)):
-                message = f"has rows of clips that are not here: {few(strangers)}; a misspelt name loses its attributes"
+            if unknown := sorted(set(read_clip_table(folder.root)) - set(folder.names)):
+                message = f"has rows of clips that are not here: {few(unknown)}; a misspelt name loses its attributes"
                 findings.note("clips_table", "clips.csv", message)
     return clips
 
 
 def _examine_all(
     rules: Rules, view: CorpusView, folder: CorpusFolder, *, workers: int | None, scheduler: str | None, progress: bool
-) -> list[ClipFacts]:
+) -> list[ClipInfo]:
     tasks = [
         ClipFiles(name, clip.identity, folder.motions.get(name), folder.sounds.get(name))
         for name in folder.names
         if (clip := view.parse(name)) is not None
     ]
-    examined: dict[str, ClipFacts] = {}
+    examined: dict[str, ClipInfo] = {}
     work: Any = partial(examine, rules) if folder.packed is None else partial(examine_packed, rules, folder.packed)
     results = run_tasks(
         work,
         tasks,
         workers=workers,
         scheduler=scheduler,
-        reads=[folder.root] if folder.packed is None else folder.packed.places,
+        reads=[folder.root] if folder.packed is None else folder.packed.folders,
         progress="clips" if progress else "",
     )
     with closing(results):
         for task, facts in results:
             if isinstance(facts, WorkerDied):
-                facts = ClipFacts(task.name)
+                facts = ClipInfo(task.name)
                 message = "killed the process that read it: badly damaged, or too little memory; get its files again"
                 facts.findings.error("clip_unreadable", task.name, message)
             examined[task.name] = facts
@@ -266,12 +264,12 @@ def _without_split(view: CorpusView, clips: Mapping[str, Clip]) -> list[str]:
 
 
 def _check_both_files(view: CorpusView, folder: CorpusFolder, findings: Findings) -> None:
-    for files, others, what, kind in (
+    for files, partners, fault, kind in (
         (folder.sounds, folder.motions, "speech without motion", "motion_missing"),
         (folder.motions, folder.sounds, "motion without speech", "sound_missing"),
     ):
-        for name in sorted(name for name in files if name not in others and view.parse(name) is not None):
-            findings.warning(kind, name, f"{what}, so not used; get the other file or remove this one")
+        for name in sorted(name for name in files if name not in partners and view.parse(name) is not None):
+            findings.warning(kind, name, f"{fault}, so not used; get the other file or remove this one")
 
 
 def _check_subjects(clips: Mapping[str, Clip], with_template: set[str], findings: Findings) -> None:
@@ -289,15 +287,15 @@ def _check_subjects(clips: Mapping[str, Clip], with_template: set[str], findings
 # Findings about all clips together: topology, form of the speech, frame rate, copies.
 
 
-def _check_vertex_counts(facts: Iterable[ClipFacts], findings: Findings) -> None:
+def _check_vertex_counts(facts: Iterable[ClipInfo], findings: Findings) -> None:
     counts = Counter(clip.n_vertices for clip in facts if clip.n_vertices is not None)
     if len(counts) > 1:
-        listed = ", ".join(f"{number(count)} ({counted(clips, 'clip')})" for count, clips in counts.most_common())
-        message = f"motions of several topologies are mixed: vertices {listed}; keep one corpus to a folder"
+        numbers = ", ".join(f"{number(count)} ({counted(clips, 'clip')})" for count, clips in counts.most_common())
+        message = f"motions of several topologies are mixed: vertices {numbers}; keep one corpus to a folder"
         findings.error("mixed_vertex_counts", "vertices_npy", message)
 
 
-def _check_sound_forms(facts: Iterable[ClipFacts], findings: Findings) -> None:
+def _check_sound_forms(facts: Iterable[ClipInfo], findings: Findings) -> None:
     forms = Counter((clip.sample_rate, clip.channels) for clip in facts if clip.sample_rate is not None)
     for (rate, channels), count in forms.most_common():
         if (rate, channels) != (16_000, 1):
@@ -307,42 +305,42 @@ def _check_sound_forms(facts: Iterable[ClipFacts], findings: Findings) -> None:
 
 
 def _check_frame_rate(
-    view: CorpusView, stored: float, facts: Sequence[ClipFacts], findings: Findings, *, recorded: bool
+    view: CorpusView, stored: float, facts: Sequence[ClipInfo], findings: Findings, *, recorded: bool
 ) -> bool:
     """Whether the lengths of the speech agree with the frame rate; one finding if most clips disagree."""
     rates = [clip.frames / clip.seconds for clip in facts if clip.frames is not None and clip.seconds]
     # Only twice and half the rate are recognised: other ratios come from clips that are cut differently.
     measured = median(rates) if rates else stored
-    other = next((factor * stored for factor in (2.0, 0.5) if is_about(measured, factor * stored)), None)
-    if other is None:
+    rate = next((factor * stored for factor in (2.0, 0.5) if is_about(measured, factor * stored)), None)
+    if rate is None:
         return True
-    readable = other >= view.frame_rate and (other / view.frame_rate).is_integer()
-    remedy = f'write {{"frame_rate": {other:g}}} into manifest.json' if readable else "prepare it again"
+    readable = rate >= view.frame_rate and (rate / view.frame_rate).is_integer()
+    remedy = f'write {{"frame_rate": {rate:g}}} into manifest.json' if readable else "prepare it again"
     source = "manifest.json says" if recorded else f"copies of {view.corpus} have"
     message = (
-        f"there are about {other:g} motion frames for each second of speech, but {source} {stored:g}: motion would run "
-        f"at {stored / other:g} times its speed; {remedy}"
+        f"there are about {rate:g} motion frames for each second of speech, but {source} {stored:g}: motion would run "
+        f"at {stored / rate:g} times its speed; {remedy}"
     )
     findings.error("frame_rate", "vertices_npy", message)
     return False
 
 
-def _check_copies(facts: Iterable[ClipFacts], findings: Findings) -> None:
+def _check_copies(facts: Iterable[ClipInfo], findings: Findings) -> None:
     names: dict[str, list[str]] = {}
     for clip in facts:
         for where, digest in clip.hashes.items():
             names.setdefault(f"{digest}{where[-4:]}", []).append(where)
-    for where, *others in names.values():
-        same = f"holds the same bytes as {', '.join(others[:FEW])}{' …' if len(others) > FEW else ''}: one of them"
-        if others and where.endswith(".npy"):
+    for where, *copies in names.values():
+        same = f"holds the same bytes as {', '.join(copies[:FEW])}{' …' if len(copies) > FEW else ''}: one of them"
+        if copies and where.endswith(".npy"):
             message = f"{same} is a copy under a wrong name; get it again or remove it"
             findings.error("motion_copied", where, message)
-        elif others:
+        elif copies:
             message = f"{same} may have a wrong name; compare it with its source"
             findings.warning("sound_copied", where, message)
 
 
-# Counting clips, frames and seconds by split and by subject, and what is missing.
+# Counting clips, frames and seconds by split and by subject, and missing clips.
 
 
 def _count_splits(
@@ -357,15 +355,15 @@ def _count_splits(
         for split, names in members.items():
             expected = view.expected.get(split)
             if names or expected:
-                missing = sorted(set(expected or ()) - set(names))
+                gaps = sorted(set(expected or ()) - set(names))
                 row = {
                     "way": way,
                     "split": split,
                     "expected": None if expected is None else len(expected),
                     "present": len(names),
-                    "missing": None if expected is None else len(missing),
+                    "missing": None if expected is None else len(gaps),
                     **_amount(view, names, frames),
-                    "missing_clips": missing,
+                    "missing_clips": gaps,
                 }
                 rows.append(row)
     if clips:  # a folder without clips has been reported already
@@ -385,17 +383,17 @@ def _amount(view: CorpusView, names: Iterable[str], frames: Mapping[str, int]) -
 def _report_missing(view: CorpusView, clips: Mapping[str, Clip], findings: Findings) -> None:
     lacking = False
     for split, names in view.expected.items():
-        missing = [name for name in names if name not in clips]
-        if not missing:
+        gaps = [name for name in names if name not in clips]
+        if not gaps:
             continue
-        listed = f"{counted(len(missing), 'clip')} of {number(len(names))} not there: {few(missing)}"
-        listed += " (--json lists all)" if len(missing) > FEW else ""
+        message = f"{counted(len(gaps), 'clip')} of {number(len(names))} not there: {few(gaps)}"
+        message += " (--json lists all)" if len(gaps) > FEW else ""
         incomplete = view.circulating is not None and view.circulating.incomplete
-        if incomplete and len(missing) <= NEVER_RECORDED * len(names):
-            findings.note("clips_missing", f"split {split}", f"{listed}; some were never recorded")
+        if incomplete and len(gaps) <= NEVER_RECORDED * len(names):
+            findings.note("clips_missing", f"split {split}", f"{message}; some were never recorded")
         else:
             lacking = True
-            message = f"{listed}; scores are comparable with published ones only if all are there"
+            message = f"{message}; scores are comparable with published ones only if all are there"
             findings.warning("clips_missing", f"split {split}", message)
     if lacking and view.obtain:
         findings.note("obtain", view.corpus, view.obtain)
@@ -429,7 +427,7 @@ def _count_subjects(
     names_of: dict[str, list[str]] = {}
     for name, clip in clips.items():
         names_of.setdefault(clip.identity, []).append(name)
-    others = sorted({*names_of, *templates} - set(view.identities))
+    untrained = sorted({*names_of, *templates} - set(view.identities))
     return [
         {
             "subject": subject,
@@ -438,5 +436,5 @@ def _count_subjects(
             **_amount(view, names_of.get(subject, []), frames),
             "template": subject in templates,
         }
-        for subject in [*view.identities, *others]
+        for subject in [*view.identities, *untrained]
     ]

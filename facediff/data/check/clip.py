@@ -63,7 +63,7 @@ class Rules:
 
 
 @dataclass
-class ClipFacts:
+class ClipInfo:
     """The properties of one clip; None for those that cannot be read."""
 
     name: str
@@ -76,30 +76,30 @@ class ClipFacts:
     findings: Findings = field(default_factory=Findings)
 
 
-def examine(rules: Rules, clip: ClipFiles) -> ClipFacts:
+def examine(rules: Rules, clip: ClipFiles) -> ClipInfo:
     """Check one clip; every exception becomes a finding."""
-    facts = ClipFacts(clip.name)
+    info = ClipInfo(clip.name)
     try:
         if clip.motion is not None:
-            _check_motion(facts, rules, clip.motion, clip.subject)
+            _check_motion(info, rules, clip.motion, clip.subject)
         if clip.sound is not None:
-            _check_sound(facts, rules, clip.sound)
-        if facts.frames is not None and facts.seconds is not None:
-            compare_lengths(facts, rules.stored_frame_rate, facts.frames, facts.seconds)
+            _check_sound(info, rules, clip.sound)
+        if info.frames is not None and info.seconds is not None:
+            compare_lengths(info, rules.stored_frame_rate, info.frames, info.seconds)
         for path in (clip.motion, clip.sound):
             if path is not None and not rules.quick and path.is_file() and path.stat().st_size:
-                facts.hashes[relative(path, rules.root)] = sha256(path)
+                info.hashes[relative(path, rules.root)] = sha256(path)
     except Exception as error:  # one strange clip must not end the check of all others
         message = f"could not be checked ({type(error).__name__}: {error}); get its files again"
-        facts.findings.error("clip_unreadable", clip.name, message)
-    return facts
+        info.findings.error("clip_unreadable", clip.name, message)
+    return info
 
 
 # Motion.
 
 
-def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> None:
-    findings, where, expected = facts.findings, relative(path, rules.root), rules.n_vertices
+def _check_motion(info: ClipInfo, rules: Rules, path: Path, subject: str) -> None:
+    findings, where, expected = info.findings, relative(path, rules.root), rules.n_vertices
     if not path.is_file():  # a pipe would be waited for
         findings.error("motion_unreadable", where, "is no regular file; put the motion there")
         return
@@ -112,13 +112,13 @@ def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> N
     except FaceDiffError as error:
         findings.error("motion_unreadable", where, str(error).removeprefix(f"{path}: "))
         return
-    facts.n_vertices = vertices_of(array.shape)
+    info.n_vertices = vertices_of(array.shape)
     if not np.issubdtype(array.dtype, np.floating):
         message = f"holds {array.dtype}, expected floating-point vertices; write it again"
         findings.error("motion_dtype", where, message)
         return
-    if facts.n_vertices != expected:
-        topology = "which is no number of vertices" if facts.n_vertices is None else f"{facts.n_vertices} vertices"
+    if info.n_vertices != expected:
+        topology = "which is no number of vertices" if info.n_vertices is None else f"{info.n_vertices} vertices"
         message = (
             f"has shape {array.shape}, {topology}; expected (frames, {3 * expected}), {expected} vertices: it has "
             f"another topology or is no motion"
@@ -130,7 +130,7 @@ def _check_motion(facts: ClipFacts, rules: Rules, path: Path, subject: str) -> N
         return
     if array.dtype == np.float16:
         findings.warning("motion_dtype", where, "is in half precision, some three digits; get it in float32")
-    facts.frames = len(array) if rig is None else motion.frames
+    info.frames = len(array) if rig is None else motion.frames
     if not rules.quick:
         check_vertices(findings, array.reshape(len(array), expected, 3), where, subject, rules.templates)
 
@@ -143,26 +143,26 @@ def check_vertices(findings: Findings, motion: Array, where: str, subject: str, 
 
 def _check_frames(findings: Findings, motion: Array, where: str) -> bool:
     """Read all frames (T, V, 3); returns whether any is finite."""
-    bad, first_bad, moved = 0, 0, 0.0
+    damaged, first_damaged, largest = 0, 0, 0.0
     start: npt.NDArray[np.float32] | None = None
     for first in range(0, len(motion), CHUNK):
         with np.errstate(all="ignore"):  # what float32 cannot hold is infinite for the models too
             chunk = np.asarray(motion[first : first + CHUNK], np.float32)
         finite = np.isfinite(chunk).all((1, 2))
         if not finite.all():
-            first_bad = first_bad if bad else first + int(np.argmin(finite))
-            bad += int((~finite).sum())
+            first_damaged = first_damaged if damaged else first + int(np.argmin(finite))
+            damaged += int((~finite).sum())
             chunk = chunk[finite]
         if len(chunk):
             start = chunk[0].copy() if start is None else start
-            moved = max(moved, float(np.abs(chunk - start).max()))
-    if bad:
+            largest = max(largest, float(np.abs(chunk - start).max()))
+    if damaged:
         message = (
-            f"{bad} of {len(motion)} frames hold NaN or infinity, the first is frame {first_bad} (counted from 0); get "
-            f"the clip again or remove it"
+            f"{damaged} of {len(motion)} frames hold NaN or infinity, the first is frame {first_damaged} (counted from "
+            f"0); get the clip again or remove it"
         )
         findings.error("motion_not_finite", where, message)
-    if start is not None and len(motion) > 1 and moved <= STILL * _size(start):
+    if start is not None and len(motion) > 1 and largest <= STILL * _size(start):
         findings.error("motion_still", where, "never moves: all frames are equal; get the clip again or remove it")
     return start is not None
 
@@ -179,7 +179,7 @@ def _compare_with_templates(
         return
     share = float(np.median([_distance(frame, template) for frame in frames])) / size
     mean = frames.mean(axis=0)
-    distances = {name: _distance(mean, np.asarray(other, np.float64)) for name, other in templates.items()}
+    distances = {name: _distance(mean, np.asarray(face, np.float64)) for name, face in templates.items()}
     nearest = min(distances, key=lambda name: distances[name])
     if share > NEAR and distances[nearest] < NEARER * distances[subject]:
         message = (
@@ -211,8 +211,8 @@ def _distance(frame: npt.NDArray[np.float64], template: npt.NDArray[np.float64])
 # Speech.
 
 
-def _check_sound(facts: ClipFacts, rules: Rules, path: Path) -> None:
-    findings, where = facts.findings, relative(path, rules.root)
+def _check_sound(info: ClipInfo, rules: Rules, path: Path) -> None:
+    findings, where = info.findings, relative(path, rules.root)
     before = len(findings)
     if not path.is_file():
         findings.error("sound_unreadable", where, "is no regular file; put the recording there")
@@ -221,8 +221,8 @@ def _check_sound(facts: ClipFacts, rules: Rules, path: Path) -> None:
         if not path.stat().st_size:
             findings.error("sound_empty", where, "the file is empty; get the recording again")
             return
-        if (missing := cut_short(path)) is not None:
-            findings.error("sound_truncated", where, f"{CUT}: {missing}; copy it again")
+        if (fault := cut_short(path)) is not None:
+            findings.error("sound_truncated", where, f"{CUT}: {fault}; copy it again")
             return
         with open_sound(path) as file:
             frames, rate, channels = file.frames, file.samplerate, file.channels
@@ -238,9 +238,9 @@ def _check_sound(facts: ClipFacts, rules: Rules, path: Path) -> None:
         message = f"not a readable sound file ({error}); expected a .wav recording, copy it again"
         findings.error("sound_unreadable", where, message)
         return
-    facts.sample_rate, facts.channels = int(rate), int(channels)
+    info.sample_rate, info.channels = int(rate), int(channels)
     if len(findings) == before:
-        facts.seconds = frames / rate
+        info.seconds = frames / rate
 
 
 def _decode(findings: Findings, file: Any, where: str) -> None:  # noqa: ANN401 - soundfile has no types
@@ -261,7 +261,7 @@ def _decode(findings: Findings, file: Any, where: str) -> None:  # noqa: ANN401 
 # Both together.
 
 
-def compare_lengths(facts: ClipFacts, frame_rate: float, frames: int, seconds: float) -> None:
+def compare_lengths(info: ClipInfo, frame_rate: float, frames: int, seconds: float) -> None:
     """Report motion and speech of different length."""
     motion = frames / frame_rate
     difference = abs(motion - seconds)
@@ -271,19 +271,19 @@ def compare_lengths(facts: ClipFacts, frame_rate: float, frames: int, seconds: f
         f"the motion lasts {motion:.2f} s ({frames} frames at {frame_rate:g} a second), the speech {seconds:.2f} s"
     )
     if difference > MUCH[0] and difference > MUCH[1] * max(motion, seconds):
-        other = next((rate for rate in (2.0, 0.5) if is_about(frames / seconds, rate * frame_rate)), None)
-        hint = f", as if there were {other * frame_rate:g} frames a second" if other else ""
+        factor = next((factor for factor in (2.0, 0.5) if is_about(frames / seconds, factor * frame_rate)), None)
+        hint = f", as if there were {factor * frame_rate:g} frames a second" if factor else ""
         message = (
             f"{lengths}{hint}: they do not belong together, or one of them is cut; get the clip again or remove it"
         )
-        facts.findings.error("length", facts.name, message)
+        info.findings.error("length", info.name, message)
     elif seconds < motion:
         message = f"{lengths}: the speech is filled up with silence at its end"
-        facts.findings.warning("speech_shorter", facts.name, message)
+        info.findings.warning("speech_shorter", info.name, message)
     else:
-        facts.findings.warning("speech_longer", facts.name, f"{lengths}: the end of the speech is left out")
+        info.findings.warning("speech_longer", info.name, f"{lengths}: the end of the speech is left out")
 
 
-def is_about(value: float, other: float) -> bool:
+def is_about(value: float, rate: float) -> bool:
     """Whether two rates are equal but for the few frames by which clips differ."""
-    return abs(value / other - 1) < 0.1
+    return abs(value / rate - 1) < 0.1

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast, get_args, get_origin, get_type_hints
 
 from facediff.data.check.report import Findings, few
 from facediff.data.manifest import load_manifest
 from facediff.data.storage import WEIGHTS_FOLDER, rig_path
-from facediff.errors import FaceDiffError, choices, lacking, number
+from facediff.errors import FaceDiffError, choices, damaged, lacking, number
 from facediff.utils.arrays import open_array, vertices_of
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class CorpusFolder:
 
 @dataclass(frozen=True)
 class CorpusView:
-    """The facts about a corpus that the check needs, from its data module or from a person's own folder."""
+    """The properties of a corpus that the check needs, from its data module or the manifest of a person's folder."""
 
     corpus: str
     data_module: str | None  # import path; None for a person's folder
@@ -122,8 +122,6 @@ def view_of(root: Path, corpus: str | None) -> CorpusView:
     from facediff.data.corpus import MOTION_FOLDERS
     from facediff.data.manifest import read_manifest
 
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
     if (root / STATE).is_file() and not (root / MANIFEST).is_file():
         raise FaceDiffError(f"{root}: its preparation was interrupted; run the same `facediff data prepare` again")
     manifest, findings = read_manifest(root), Findings()
@@ -141,12 +139,10 @@ def list_folder(root: Path, motion_folders: tuple[str, ...]) -> CorpusFolder:
     folder = CorpusFolder(root)
     motions = [(name, ".npy", folder.motions) for name in (*motion_folders, WEIGHTS_FOLDER)]
     for name, suffix, files in [*motions, ("wav", ".wav", folder.sounds)]:
-        try:
-            paths = sorted(root / name / file for file in os.listdir(root / name))
-        except (FileNotFoundError, NotADirectoryError):
+        if not (root / name).is_dir():
             continue
-        except OSError as error:
-            raise FaceDiffError(f"{root / name}: cannot be read ({error.strerror}); check its permissions") from error
+        with damaged(f"{root / name}: cannot be read", "check its permissions", OSError):
+            paths = sorted(root / name / file for file in os.listdir(root / name))
         for path in paths:
             if path.name.startswith("."):
                 if ".partial-" in path.name:
@@ -163,7 +159,7 @@ def list_packed(packed: PackedCorpus) -> CorpusFolder:
     return CorpusFolder(packed.folder, motions, sounds, packed=packed)
 
 
-def read_record(root: Path, name: str, findings: Findings) -> dict[str, Any]:
+def manifest_in(root: Path, name: str, findings: Findings) -> dict[str, Any]:
     """``manifest.json`` or ``prepare.json``; empty if it is missing or cannot be read."""
     path = root / name
     if path.is_file():
@@ -193,12 +189,12 @@ def by_name(name: str, n_vertices: int | None, option: str = "--corpus") -> Modu
 
 
 def recognise(folder: CorpusFolder, recorded: object, n_vertices: int | None) -> Module | None:
-    """The data module that ``manifest.json`` names, else the one of these vertices whose names most clips have."""
+    """The data module that ``manifest.json`` names, else the one of these vertices that names most clips."""
     modules = _known()
     if isinstance(recorded, str):
-        named = [m for m in modules if m.corpus_name in (recorded, recorded.removeprefix("facediff-"))]
-        if named:
-            return next((module for module in named if module.n_vertices == n_vertices), named[0])
+        fitting = [m for m in modules if m.corpus_name in (recorded, recorded.removeprefix("facediff-"))]
+        if fitting:
+            return next((module for module in fitting if module.n_vertices == n_vertices), fitting[0])
     fitting = [module for module in modules if module.n_vertices == n_vertices]
     counts = {module: sum(module.parse_name(name) is not None for name in folder.names) for module in fitting}
     return max(fitting, key=lambda module: counts[module]) if any(counts.values()) else None
@@ -217,27 +213,27 @@ def _known() -> list[Module]:
             yield from below(child)
 
     modules = dict.fromkeys(below(SpeechMotionDataModule))
-    named = [m for m in modules if not inspect.isabstract(m) and getattr(m, "corpus_name", None)]
-    concrete = [m for m in named if m.space.is_vertices]
-    return sorted(concrete, key=lambda module: not module.__module__.startswith("facediff."))
+    concrete = [m for m in modules if not inspect.isabstract(m) and getattr(m, "corpus_name", None)]
+    return sorted(
+        (m for m in concrete if m.space.is_vertices), key=lambda module: not module.__module__.startswith("facediff.")
+    )
 
 
 def _import(path: str, option: str) -> Module:
     from facediff.data import SpeechMotionDataModule
 
-    place, _, name = path.rpartition(".")
+    package, _, name = path.rpartition(".")
     try:
-        module = getattr(importlib.import_module(place), name)
+        module = getattr(importlib.import_module(package), name)
+        fault = lacking(module) if issubclass(module, SpeechMotionDataModule) else "is no data module"
     except Exception as error:  # a module can fail in any way while it is imported
-        raise FaceDiffError(f"{option} {path}: cannot be imported ({error}); expected package.module.Class") from error
-    if not (isinstance(module, type) and issubclass(module, SpeechMotionDataModule)):
-        raise FaceDiffError(f"{option} {path}: is no data module; expected a subclass of SpeechMotionDataModule")
-    if fault := lacking(module):
-        raise FaceDiffError(f"{option} {path}: {fault}")
-    return module
+        fault = f"cannot be imported ({error})"
+    if fault:
+        raise FaceDiffError(f"{option} {path}: {fault}; expected package.module.Class of a data module")
+    return cast("Module", module)
 
 
-# The facts that the check needs.
+# The properties that the check needs.
 
 
 def _view_of_module(module: Module, root: Path) -> CorpusView:
@@ -245,7 +241,7 @@ def _view_of_module(module: Module, root: Path) -> CorpusView:
     ways: list[str | None] = list(get_args(hint)) if get_origin(hint) is Literal else [None]
     modules = {way: instance(module, root, way) for way in ways}
     first = modules[ways[0]]
-    facts = ("mesh_files", "region_sources", "region_help", "obtain", "unit", "circulating")
+    names = ("mesh_files", "region_sources", "region_help", "obtain", "unit", "circulating")
     return CorpusView(
         corpus=module.corpus_name,
         data_module=f"{module.__module__}.{module.__qualname__}",
@@ -256,20 +252,14 @@ def _view_of_module(module: Module, root: Path) -> CorpusView:
         split_of={way: data.split_of for way, data in modules.items()},
         identities=list(first.identities),
         expected=module.expected_clips(),
-        **{name: getattr(module, name) for name in facts},
+        **{name: getattr(module, name) for name in names},
     )
 
 
 def instance(module: Module, root: Path, way: str | None) -> SpeechMotionDataModule:
     """The data module of a folder, for one of the ways in which the corpus is split."""
     options: dict[str, Any] = {} if way is None else {"split": way}
-    try:
-        return module(root=str(root), **options)
-    except TypeError as error:
-        raise FaceDiffError(
-            f"--corpus {module.__name__}: cannot be instantiated from a folder alone ({error}); give the other "
-            f"parameters defaults"
-        ) from error
+    return module(root=str(root), **options)
 
 
 def is_rate(value: object) -> TypeGuard[float]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from facediff import registry
 from facediff.data.check.report import CheckReport, few, relative
 from facediff.errors import FaceDiffError
 from facediff.spaces.layouts import LAYOUTS
@@ -29,23 +30,16 @@ def parametric_module(root: Path, corpus: str | None, manifest: dict[str, Any]) 
         corpus: name of the corpus that the user gave, for arrays with their layout: ``flame_clips:flame_artalk``.
         manifest: of the folder.
     """
-    from facediff.data.parametric import Beat, FlameClips, LiveLink
+    from facediff.data.parametric import ParametricDataModule
 
-    if corpus is not None:
-        name = corpus.partition(":")[0].lower()
-        return next((m for m in (Beat, LiveLink, FlameClips) if name in (m.corpus_name, m.__name__.lower())), None)
-    if manifest.get("layout") == "live_link":
-        return LiveLink
+    entries = [entry.implementation for entry in registry.corpus]
+    modules: list[type[ParametricDataModule]] = [m for m in entries if issubclass(m, ParametricDataModule)]
+    if name := (corpus or "").partition(":")[0].lower() or str(manifest.get("layout", "")):
+        return next((module for module in modules if name in (module.corpus_name, module.__name__.lower())), None)
     if any((root / folder).is_dir() for folder in ("vertices_npy", "vertex", "weights_npy", "values_npy")):
         return None
-    for module in (Beat, LiveLink):
-        recordings = _folder(module, root, None)
-        names = recordings.names()
-        if module is Beat:
-            names = [name for name in names if Beat.parse_name(name) is not None]
-        if names:
-            return module
-    return None
+    modules_by_channels = (module for module in modules if module.names_channels)
+    return next((module for module in modules_by_channels if module.speakers_in(root)), None)
 
 
 def _folder(module: type[ParametricDataModule], root: Path, layout: str | None) -> RecordingFolder:
@@ -56,13 +50,13 @@ def _folder(module: type[ParametricDataModule], root: Path, layout: str | None) 
 
 
 def check_recordings(report: CheckReport, root: Path, module: type[ParametricDataModule], corpus: str | None) -> None:
-    """Add to a report what a folder of recordings holds and what is wrong in it.
+    """Add the contents and the defects of a folder of recordings to a report.
 
     Args:
         report: the report.
         root: the folder.
         module: its data module.
-        corpus: what the user called it, with the layout of arrays.
+        corpus: its name as the user gave it, with the layout of arrays.
     """
     from facediff.speech.audio import SAMPLE_RATE, read_speech
 
@@ -90,16 +84,16 @@ def check_recordings(report: CheckReport, root: Path, module: type[ParametricDat
                 continue
             channels = clip.space.channels
             report.n_vertices = len(channels)
-            absent = f", without {few(clip.space.absent)}" if clip.space.absent else ""
+            without = f", without {few(clip.space.absent)}" if clip.space.absent else ""
             version = f" {clip.space.version}" if clip.space.version else ""
-            orders[f"{clip.layout or clip.space.kind}{version}: {len(channels)} channels{absent}"] += 1
+            orders[f"{clip.layout or clip.space.kind}{version}: {len(channels)} channels{without}"] += 1
             rates[clip.frame_rate] += 1
             for note in clip.notes:
                 findings.warning("remark", where, note)
-            least, most, moves = (of(axis=0) for of in (clip.values.min, clip.values.max, clip.values.std))
-            low = least if low is None else np.minimum(low, least)
-            high = most if high is None else np.maximum(high, most)
-            deviation = moves if deviation is None else np.maximum(deviation, moves)
+            minimum, maximum, std = (of(axis=0) for of in (clip.values.min, clip.values.max, clip.values.std))
+            low = minimum if low is None else np.minimum(low, minimum)
+            high = maximum if high is None else np.maximum(high, maximum)
+            deviation = std if deviation is None else np.maximum(deviation, std)
             seconds = len(read_speech(folder.files[name][1])) / SAMPLE_RATE
             if abs(seconds - clip.duration) > SOUND_DIFFERS:
                 findings.warning(
@@ -127,8 +121,8 @@ def check_recordings(report: CheckReport, root: Path, module: type[ParametricDat
     for order, count in orders.items():
         findings.note("order", str(count), f"recordings in the order {order}")
     if len(rates) > 1:
-        shown = ", ".join(f"{count} of {rate:g}" for rate, count in sorted(rates.items()))
-        findings.note("rates", "frame rate", f"several: {shown} a second; all are read at {module.frame_rate:g}")
+        counts = ", ".join(f"{count} of {rate:g}" for rate, count in sorted(rates.items()))
+        findings.note("rates", "frame rate", f"several: {counts} a second; all are read at {module.frame_rate:g}")
     if low is not None and high is not None and deviation is not None:
         _check_values(report, folder, channels, low, high, deviation)
 
@@ -141,11 +135,11 @@ def _check_values(
     high: np.ndarray[Any, Any],
     deviation: np.ndarray[Any, Any],
 ) -> None:
-    absent = {name.casefold() for name in folder.space.absent}
+    unrecorded = {name.casefold() for name in folder.space.absent}
     dead = [
         name
-        for name, moves in zip(channels, deviation, strict=True)
-        if moves <= FLOOR * deviation.max() and name.casefold() not in absent
+        for name, std in zip(channels, deviation, strict=True)
+        if std <= FLOOR * deviation.max() and name.casefold() not in unrecorded
     ]
     if dead:
         report.findings.note("dead", few(dead), "never move in this folder: a model learns nothing about them")
@@ -154,9 +148,9 @@ def _check_values(
         return
     turning = {*folder.space.head, *folder.space.eyes}
     beyond = [
-        f"{name} {least:.2f} to {most:.2f}"
-        for column, (name, least, most) in enumerate(zip(channels, low, high, strict=True))
-        if column not in turning and (least < span[0] or most > span[1])
+        f"{name} {minimum:.2f} to {maximum:.2f}"
+        for column, (name, minimum, maximum) in enumerate(zip(channels, low, high, strict=True))
+        if column not in turning and (minimum < span[0] or maximum > span[1])
     ]
     if beyond:
         report.findings.warning(

@@ -78,7 +78,7 @@ class CheckReport:
     splits: list[dict[str, Any]] = field(default_factory=list)
     # one row a subject: subject, trained_on, clips, frames, seconds, template
     subjects: list[dict[str, Any]] = field(default_factory=list)
-    # file, subjects, broken (subjects whose template cannot be used), blob (git blob id), origin (whose file it is),
+    # file, subjects, broken (subjects without a usable template), blob (git blob id), origin (project of the file),
     # areas
     templates: dict[str, Any] = field(default_factory=dict)
     mesh: str | None = None  # the mesh file that is used; None if there is none

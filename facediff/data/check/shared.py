@@ -13,7 +13,7 @@ import numpy.typing as npt
 from facediff.data.check.clip import Array
 from facediff.data.check.layouts import MANIFEST, STATE, CorpusView
 from facediff.data.check.report import Findings, few, relative
-from facediff.errors import FaceDiffError, counted, number
+from facediff.errors import counted, number
 from facediff.mesh.mesh import surface_area
 from facediff.utils.checksums import sha256
 
@@ -77,14 +77,14 @@ def _is_below(root: Path, path: Path) -> bool:
 
 
 def check_account(manifest: Mapping[str, Any], findings: Findings) -> None:
-    """Repeat what preparation itself has reported: clips that failed, and what the raw folder lacked."""
-    failed, missing = manifest.get("failed"), manifest.get("missing")
+    """Repeat the report of the preparation: clips that failed, and gaps in the raw folder."""
+    failed, gaps = manifest.get("failed"), manifest.get("missing")
     if isinstance(failed, dict) and failed:
         name, reason = next(iter(failed.items()))
         message = f"{counted(len(failed), 'clip')} could not be prepared, the first: {name}: {reason}"
         findings.warning("prepare_failed", MANIFEST, message)
-    if isinstance(missing, dict) and missing:
-        message = f"the raw folder was not complete: {few(missing)}; the reasons are in {MANIFEST}"
+    if isinstance(gaps, dict) and gaps:
+        message = f"the raw folder was not complete: {few(gaps)}; the reasons are in {MANIFEST}"
         findings.note("prepare_missing", MANIFEST, message)
 
 
@@ -118,13 +118,13 @@ def _origin(view: CorpusView, blob: str, findings: Findings) -> str | None:
     circulating = {} if view.circulating is None else view.circulating.templates
     if not circulating:
         return None
-    origin = next((who for start, who in circulating.items() if blob.startswith(start)), "own")
+    origin = next((project for start, project in circulating.items() if blob.startswith(start)), "own")
     if len(circulating) > 1:
-        others = ", ".join(f"{who} ({start})" for start, who in circulating.items() if who != origin)
-        whose = "none of the files that circulate" if origin == "own" else f"the templates of {origin}"
+        projects = ", ".join(f"{project} ({start})" for start, project in circulating.items() if project != origin)
+        owner = "none of the files that circulate" if origin == "own" else f"the templates of {origin}"
         message = (
-            f"{whose} (git blob {blob[:8]}); a checkpoint needs the templates that it was trained with, and there are "
-            f"others: {others}"
+            f"{owner} (git blob {blob[:8]}); a checkpoint needs the templates that it was trained with, and there are "
+            f"others: {projects}"
         )
         findings.note("templates_origin", "templates.pkl", message)
     return origin
@@ -140,10 +140,10 @@ def check_areas(
     if view.circulating is None or not view.circulating.unit_area or not templates:
         return None
     areas = {subject: surface_area(template, faces) for subject, template in sorted(templates.items())}
-    other = {subject: area for subject, area in areas.items() if abs(area - 1) > AREA_TOLERANCE}
-    if other and (not isinstance(unit, str) or unit.startswith("normalised")):
+    unequal = [f"{subject} {area:.4g}" for subject, area in areas.items() if abs(area - 1) > AREA_TOLERANCE]
+    if unequal and (not isinstance(unit, str) or unit.startswith("normalised")):
         message = (
-            f"the surface area is not 1 ({few(f'{subject} {area:.4g}' for subject, area in other.items())}): not "
+            f"the surface area is not 1 ({few(unequal)}): not "
             f"CodeTalker's normalisation, so scores are not comparable with published ones; prepare the folder again "
             f"from the raw files unless this is intended"
         )
@@ -158,25 +158,24 @@ def check_mesh(root: Path, view: CorpusView, findings: Findings) -> tuple[npt.ND
     """Check the mesh file; returns its faces (F, 3) if they can be used, and its path relative to the folder."""
     from facediff.mesh import read_mesh
 
-    places = [folder / file for file in view.mesh_files for folder in (root, root / "templates")]
-    path = next((place for place in places if place.is_file()), None)
+    paths = [folder / file for file in view.mesh_files for folder in (root, root / "templates")]
+    path = next(filter(Path.is_file, paths), None)
     if path is None:
-        if places:
-            looked = " or ".join(relative(place, root) for place in places)
-            message = f"no mesh file (looked for {looked}): without faces no picture can be drawn; put one there"
+        if paths:
+            names = " or ".join(relative(path, root) for path in paths)
+            message = f"no mesh file (looked for {names}): without faces no picture can be drawn; put one there"
             findings.warning("mesh_missing", view.mesh_files[0], message)
         return None, None
     faces: npt.NDArray[np.int32] | None = None
     with findings.guard("mesh_broken", path, root):
         mesh = read_mesh(path)
-        if len(mesh.vertices) != view.n_vertices:
-            raise FaceDiffError(
-                f"has {number(len(mesh.vertices))} vertices, expected {number(view.n_vertices)}; put the corpus's own "
-                f"mesh there"
+        if len(mesh.vertices) == view.n_vertices and 0 <= mesh.faces.min() <= mesh.faces.max() < view.n_vertices:
+            faces = mesh.faces
+        else:
+            message = (
+                f"has {number(len(mesh.vertices))} vertices, or faces of others; expected {number(view.n_vertices)}"
             )
-        if mesh.faces.min() < 0 or mesh.faces.max() >= view.n_vertices:
-            raise FaceDiffError(f"has faces of vertices beyond {view.n_vertices - 1}; get it again")
-        faces = mesh.faces
+            findings.error("mesh_broken", relative(path, root), f"{message}; put the mesh of the corpus there")
     return faces, relative(path, root)
 
 
@@ -189,8 +188,9 @@ def _check_region(
     root: Path, view: CorpusView, name: str, sources: Sequence[str], findings: Findings
 ) -> dict[str, Any] | None:
     from facediff.data.corpus import find_region
+    from facediff.metrics.regions import TOPOLOGIES, Part
 
-    # The first source whose file is there is used, as in training.
+    # The first source with a file is used, as in training.
     source = next((source for source in sources if (root / source.partition(":")[0]).is_file()), None)
     path = root / (sources[0] if source is None else source).partition(":")[0]
     section: dict[str, Any] | None = None
@@ -199,15 +199,15 @@ def _check_region(
         if region.duplicates:
             message = f"{counted(region.duplicates, 'index', 'indices')} of {name} repeated; counted once"
             findings.note("region_repeats", str(source), message)
-        usual = None if view.circulating is None else view.circulating.regions.get(str(source))
-        if usual is not None and usual != region.count:
-            message = (
-                f"{name} has {counted(region.count, 'vertex', 'vertices')}, the list that circulates under this name "
-                f"has {number(usual)}: scores over it differ from published ones"
-            )
+        topology = TOPOLOGIES.get(view.corpus)
+        part: Part = "lips" if name == "lips" else "upper"
+        counts = {} if topology is None else topology.lips if part == "lips" else topology.upper
+        published = region.count if region.count in counts else next(iter(counts), None)
+        if topology is not None and published != region.count:
+            message = f"{topology.remark(part, region)}: scores over it differ from published ones"
             findings.note("region_unusual", str(source), message)
         section = {"source": source, "count": region.count, "hash": region.hash}
-        section |= {"duplicates": region.duplicates, "circulating_count": usual}
+        section |= {"duplicates": region.duplicates, "circulating_count": published}
     return section
 
 

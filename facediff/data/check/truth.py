@@ -1,4 +1,4 @@
-"""How the truth of the built-in corpus moves, next to what was measured in people.
+"""How the truth of the built-in corpus moves, next to measurements of people.
 
 A corpus made by rules is worth as much as its motion is like people's. The measures are taken from the stored weights,
 gaze and head turns of every clip, so that a change of the rules shows.
@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER
-from facediff.errors import FaceDiffError
+from facediff.errors import damaged
 from facediff.utils.arrays import open_array
-from facediff.utils.limits import brief
 from facediff.utils.plain_files import read_rows
 
 Array = npt.NDArray[np.float64]
@@ -59,16 +58,12 @@ def measure_truth(root: Path, names: Iterable[str], rate: float) -> list[dict[st
     """
     if not all((root / f"{part}_npy").is_dir() for part in ("weights", "gaze", "head")):
         return []
-    try:
+    with damaged(f"{root}: the stored truth", REMEDY):
         return _measures(root, sorted(names), rate)
-    except FaceDiffError:
-        raise
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
-        raise FaceDiffError(f"{root}: the stored truth is damaged ({brief(error)}); {REMEDY}") from error
 
 
-def _measures(root: Path, every: list[str], rate: float) -> list[dict[str, Any]]:
-    clips = [clip for clip in _read(root, every[:: max(1, len(every) // ENOUGH)], rate) if len(clip.gaze) > 1]
+def _measures(root: Path, names: list[str], rate: float) -> list[dict[str, Any]]:
+    clips = [clip for clip in _read(root, names[:: max(1, len(names) // ENOUGH)], rate) if len(clip.gaze) > 1]
     minutes = sum(len(clip.gaze) for clip in clips) / rate / 60.0
     if not minutes:
         return []
@@ -82,7 +77,7 @@ def _measures(root: Path, every: list[str], rate: float) -> list[dict[str, Any]]
     apart = f"{np.quantile(gaps, 0.95):.2f}" if gaps else "none"
     lips, upper = ([clip.regions[name] for clip in clips] for name in ("lips", "upper_face"))
     jaw = _median_frequency([clip.weights["jawOpen"] for clip in clips], rate)
-    fine = [_share_above(region, rate, FINEST) for region in (lips, upper)]
+    shares = [_share_above(region, rate, FINEST) for region in (lips, upper)]
     rows = [
         ("blinks a minute", f"{blinks / minutes:.1f}", "26, 10 to 50 by person", "Bentivoglio and others 1997"),
         ("saccades above 1° a minute", f"{np.sum(jumps > 1.0) / minutes:.0f}", "", ""),
@@ -93,38 +88,38 @@ def _measures(root: Path, every: list[str], rate: float) -> list[dict[str, Any]]
         ("lips apart at p, b, m, 95th percentile, mm", apart, "0", "they touch"),
         ("jaw, median frequency of its velocity, Hz", f"{jaw:.1f}", "2 to 7", "Chandrasekaran and others 2009"),
         ("lips, difference ratio", f"{_difference_ratio(lips):.2f}", "", ""),
-        ("lips, share of their power above 8 Hz", f"{fine[0]:.3f}", "", ""),
+        ("lips, share of their power above 8 Hz", f"{shares[0]:.3f}", "", ""),
         ("upper face, difference ratio", f"{_difference_ratio(upper):.2f}", "", ""),
-        ("upper face, share of its power above 8 Hz", f"{fine[1]:.3f}", "", ""),
+        ("upper face, share of its power above 8 Hz", f"{shares[1]:.3f}", "", ""),
     ]
     return [dict(zip(("measure", "value", "people", "source"), row, strict=True)) for row in rows]
 
 
 def _read(root: Path, names: Iterable[str], rate: float) -> Iterator[TruthClip]:
-    """The stored truth of clips whose motion is kept as weights."""
+    """The stored truth of clips with weights."""
     shapes = [row["shape"] for row in read_rows(root / "shapes.csv", remedy=REMEDY)]
     index = {name: _indices(root, file) for name, file in (("lips", "lve.txt"), ("upper_face", "fdd.txt"))}
     pairs = _indices(root, "inner_lip_pairs.txt").reshape(-1, 2)
-    wanted = np.unique(np.concatenate([*index.values(), pairs.ravel()]))
+    points = np.unique(np.concatenate([*index.values(), pairs.ravel()]))
     rigs: dict[str, Array] = {}
     for name in names:
         if not (root / WEIGHTS_FOLDER / f"{name}.npy").is_file():
             continue
         identity = name.rpartition("_")[0]
         if identity not in rigs:
-            rigs[identity] = 1000.0 * np.asarray(open_array(root / RIGS_FOLDER / f"{identity}.npy")[:, wanted])
+            rigs[identity] = 1000.0 * np.asarray(open_array(root / RIGS_FOLDER / f"{identity}.npy")[:, points])
         rig = rigs[identity]
         weights, gaze, head = (
             np.asarray(open_array(root / f"{part}_npy" / f"{name}.npy"), np.float64)
             for part in ("weights", "gaze", "head")
         )
         vertices = rig[0] + np.einsum("tk,kvc->tvc", weights, rig[1:])
-        upper, lower = (vertices[:, np.searchsorted(wanted, side)] for side in pairs.T)
+        upper, lower = (vertices[:, np.searchsorted(points, side)] for side in pairs.T)
         gap = np.linalg.norm(upper - lower, axis=-1).max(axis=1)
         phonemes = read_rows(root / "phonemes" / f"{name}.csv", remedy=REMEDY)
         closures = [row for row in phonemes if row["ipa"][:1] in ("p", "b", "m")]
         middles = [int(0.5 * (float(row["start"]) + float(row["end"])) * rate) for row in closures]
-        regions = {part: vertices[:, np.searchsorted(wanted, at)] for part, at in index.items()}
+        regions = {part: vertices[:, np.searchsorted(points, at)] for part, at in index.items()}
         gaps = [float(gap[min(middle, len(gap) - 1)]) for middle in middles]
         yield TruthClip(dict(zip(shapes, weights.T, strict=True)), gaze, head, regions, gaps)
 

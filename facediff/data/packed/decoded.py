@@ -17,10 +17,10 @@ Key = tuple[str, int]
 
 
 class DecodedChunks:
-    """Keeps the chunks that were used last, as far as they are used again.
+    """The chunks used last, as far as they are used again.
 
-    A chunk is stored when it is read a second time, with no more others in between than fit. So a corpus that is
-    larger than the cache, whose chunks would be replaced before they are used again, does not pay for storing them.
+    A chunk is stored when it is read a second time, with no more others in between than fit. Storing would be wasted
+    on a corpus larger than the cache: its chunks would be replaced before they are used again.
 
     Args:
         limit: bytes.

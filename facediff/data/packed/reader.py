@@ -27,12 +27,11 @@ from facediff.data.packed.layout import (
     PackedClip,
     PackedSound,
     Record,
-    read_record,
 )
 from facediff.data.packed.shards import ShardedArray, chunks_of
 from facediff.data.packed.stores import ByteStore, LocalStore, RemoteStore, cache_folder, limit_bytes, open_store
 from facediff.data.storage import refuse_out_of_range, within
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
@@ -64,18 +63,18 @@ class PackedCorpus:
             raise FaceDiffError(f"{store.root}: {what}")
         text = store.whole(METADATA)
         self.source = store.source
-        self.record: Record = read_record(text, self.source)
+        self.record = Record.read(text, self.source)
         # The record holds the size and place of everything, so its hash identifies the content for caches.
         self.identity = hashlib.sha256(text).hexdigest()[:40]
         if isinstance(store, RemoteStore):
-            size = sum(sum(facts.shards) for facts in self.record.arrays.values())
+            size = sum(sum(array.shards) for array in self.record.arrays.values())
             store.cache = cache_folder(self.identity, size)
         self.store: ByteStore = store
         self._decoded_chunks = DecodedChunks(limit_bytes(VARIABLE, USUAL_GB))
-        self._arrays = {name: ShardedArray(store, name, facts) for name, facts in self.record.arrays.items()}
+        self._arrays = {name: ShardedArray(store, name, array) for name, array in self.record.arrays.items()}
 
     @property
-    def places(self) -> list[Path]:
+    def folders(self) -> list[Path]:
         """Folders that workers on other machines must see: its own, or none for an address."""
         return [Path(self.source)] if isinstance(self.store, LocalStore) else []
 
@@ -84,15 +83,15 @@ class PackedCorpus:
     @cached_property
     def folder(self) -> Path:
         """A folder on this machine with every file of the corpus but motion and speech, made on first use."""
-        place = cache_dir() / "packed" / self.identity / "corpus"
-        if not place.is_dir():
+        folder = cache_dir() / "packed" / self.identity / "corpus"
+        if not folder.is_dir():
             try:
-                with atomic_folder(place) as temporary:
+                with atomic_folder(folder) as temporary:
                     self.write_files(temporary)
             except FaceDiffError:
-                if not place.is_dir():  # else another process was quicker
+                if not folder.is_dir():  # else another process was quicker
                     raise
-        return place
+        return folder
 
     def write_files(self, folder: Path) -> None:
         """Write every file of the corpus but motion and speech."""
@@ -133,7 +132,7 @@ class PackedCorpus:
         once and cached in ``store``, like the speech of a folder.
         """
         sound = self.record.clips[name].sound
-        if _is_read_in_parts(sound):
+        if sound.form == "flac" and sound.rate == SAMPLE_RATE and sound.channels == 1:
             stop = min(first + length, sound.samples)
             samples = self.samples(name, first, stop) if stop > first else np.zeros((0, 1), np.int32)
             scale = np.float32(2.0 ** (1 - sound.bits))
@@ -148,8 +147,8 @@ class PackedCorpus:
         """All speech of a clip as 16 kHz mono (S,)."""
         sound = self.record.clips[name].sound
         if sound.form == "flac":
-            whole = self.samples(name, 0, sound.samples)
-            return to_speech(whole * np.float32(2.0 ** (1 - sound.bits)), sound.rate, self._speech_of(name))
+            samples = self.samples(name, 0, sound.samples)
+            return to_speech(samples * np.float32(2.0 ** (1 - sound.bits)), sound.rate, self._speech_of(name))
         with tempfile.TemporaryDirectory(prefix="facediff-") as folder:
             path = Path(folder) / f"{name}.wav"
             path.write_bytes(self.recording(name))
@@ -219,19 +218,19 @@ class PackedMotion:
     def offsets(self, picks: Sequence[int], template: Floats) -> Floats:
         """Offsets from the template of some frames; only the chunks that hold them are read."""
         picks = within(picks, self.frames)
-        motion = np.empty((len(picks), self.array.facts.width), np.float32)
-        rows_by_chunk = chunks_of(picks, self.array.facts.chunk)
+        motion = np.empty((len(picks), self.array.info.width), np.float32)
+        rows_by_chunk = chunks_of(picks, self.array.info.chunk)
         tasks: list[tuple[int, npt.NDArray[Any] | memoryview]] = []
-        missing = []
+        to_fetch = []
         for number in sorted(rows_by_chunk):
             chunk = self.decoded.get((self.array.name, self._begin + number))
             if chunk is None:
-                missing.append(number)
+                to_fetch.append(number)
             else:
                 tasks.append((number, chunk))
         # Neighbouring chunks are fetched together: in a store at an address each request costs a round trip.
-        try:
-            for run in _consecutive(missing):
+        with damaged(f"clip {self.clip.name}", REMEDY):
+            for run in _consecutive(to_fetch):
                 fetched = self.array.fetch(self._begin + run[0], self._begin + run[-1] + 1)
                 tasks += zip(run, fetched, strict=True)
 
@@ -248,8 +247,6 @@ class PackedMotion:
             else:
                 for task in tasks:
                     write(task)
-        except FaceDiffError as error:
-            raise FaceDiffError(f"clip {self.clip.name}: {error}") from error
         offsets = motion.reshape(len(picks), -1, 3)
         if self.clip.coding in EXACT:
             refuse_out_of_range(offsets, picks, f"{self.source}: clip {self.clip.name}")
@@ -259,7 +256,7 @@ class PackedMotion:
     @property
     def _begin(self) -> int:
         """Its first chunk in the array."""
-        return self.clip.first // self.array.facts.chunk
+        return self.clip.first // self.array.info.chunk
 
     def _summed(self, number: int, encoded: memoryview, last: int) -> npt.NDArray[Any]:
         """The rows of a chunk up to ``last`` at least, in memory that the thread's next call overwrites."""
@@ -274,30 +271,29 @@ class PackedMotion:
             self.decoded.put(key, chunk, _processes())
         return chunk
 
-    def _write(self, chunk: npt.NDArray[Any], row_places: list[tuple[int, int]], motion: Floats) -> None:
-        """Write rows of a chunk to their places in ``motion``."""
+    def _write(self, chunk: npt.NDArray[Any], rows: list[tuple[int, int]], motion: Floats) -> None:
+        """Write rows of a chunk to frames of ``motion``."""
         exact = np.dtype(self.clip.coding) if self.clip.coding in EXACT else None
         step = np.float32(self.record.step)
-        for row, place in row_places:
+        for row, frame in rows:
             if exact is None:
                 # Convert, then scale in place: a fifth faster than `row * step`, which allocates an array.
-                np.copyto(motion[place], chunk[row])
-                motion[place] *= step
+                np.copyto(motion[frame], chunk[row])
+                motion[frame] *= step
             else:
                 with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused
-                    np.copyto(motion[place], chunk[row].view(exact), casting="same_kind")
+                    np.copyto(motion[frame], chunk[row].view(exact), casting="same_kind")
 
     def vertices(self) -> npt.NDArray[np.floating]:
         """All frames as they were, bit for bit (T, V, 3), of a clip that was packed without loss."""
-        facts = self.array.facts
-        begin = self.clip.first // facts.chunk
-        rows = np.empty((self.frames, facts.width), facts.dtype)
-        stop = -(-self.frames // facts.chunk)
-        for number, encoded in enumerate(self.array.fetch(begin, begin + stop)):
-            chunk = self.array.decode(begin + number, encoded)
+        info = self.array.info
+        rows = np.empty((self.frames, info.width), info.dtype)
+        count = -(-self.frames // info.chunk)
+        for number, encoded in enumerate(self.array.fetch(self._begin, self._begin + count)):
+            chunk = self.array.decode(self._begin + number, encoded)
             np.cumsum(chunk, axis=0, dtype=chunk.dtype, out=chunk)
-            place = number * facts.chunk
-            rows[place : place + facts.chunk] = chunk[: self.frames - place]
+            first = number * info.chunk
+            rows[first : first + info.chunk] = chunk[: self.frames - first]
         return rows.view(np.dtype(self.clip.coding)).reshape(self.frames, -1, 3)
 
 
@@ -312,16 +308,11 @@ def _consecutive(numbers: Sequence[int]) -> list[list[int]]:
     return groups
 
 
-def _is_read_in_parts(sound: PackedSound) -> bool:
-    """Whether samples are used as they are stored; other speech is converted as a whole."""
-    return sound.form == "flac" and sound.rate == SAMPLE_RATE and sound.channels == 1
-
-
 def _pieces(sound: PackedSound, first: int, stop: int) -> list[tuple[int, int, int]]:
     """Number, first byte and last byte + 1 of the streams that hold samples ``first`` to ``stop``."""
     length = PIECE_SECONDS * sound.rate
-    places = [int(place) for place in np.cumsum([sound.first, *sound.pieces])]
-    return [(number, places[number], places[number + 1]) for number in range(first // length, -(-stop // length))]
+    ends = np.cumsum([sound.first, *sound.pieces]).tolist()
+    return [(number, ends[number], ends[number + 1]) for number in range(first // length, -(-stop // length))]
 
 
 def _threads() -> int:

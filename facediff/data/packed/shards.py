@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.packed.layout import DAMAGED, METADATA, ArrayFacts, check_array_metadata
-from facediff.data.packed.stores import ByteStore, Range
+from facediff.data.packed.layout import DAMAGED, METADATA, ArrayInfo, check_array_metadata
+from facediff.data.packed.stores import ByteRange, ByteStore
 from facediff.errors import FaceDiffError, needs_extra
 from facediff.utils.limits import brief
 
@@ -34,13 +34,13 @@ class ShardedArray:
     Args:
         store: where it lies.
         name: the array's name.
-        facts: its entry in the record.
+        info: its entry in the record.
     """
 
-    def __init__(self, store: ByteStore, name: str, facts: ArrayFacts) -> None:
+    def __init__(self, store: ByteStore, name: str, info: ArrayInfo) -> None:
         self.store = store
         self.name = name
-        self.facts = facts
+        self.info = info
         self._indices: dict[int, npt.NDArray[np.uint64]] = {}
         self._checked = False
         self._reset()
@@ -69,24 +69,24 @@ class ShardedArray:
 
     def chunks_of_rows(self, first: int, stop: int) -> range:
         """The chunks that hold rows ``first`` to ``stop``."""
-        return range(first // self.facts.chunk, -(-stop // self.facts.chunk)) if stop > first else range(0)
+        return range(first // self.info.chunk, -(-stop // self.info.chunk)) if stop > first else range(0)
 
     def fetch(self, first: int, stop: int) -> list[memoryview]:
         """The encoded bytes of chunks ``first`` to ``stop``, counted over the whole array."""
         if not self._checked:
             check_array_metadata(
-                self.store.whole(f"{self.name}/{METADATA}"), f"{self.store.source}/{self.name}/{METADATA}", self.facts
+                self.store.whole(f"{self.name}/{METADATA}"), f"{self.store.source}/{self.name}/{METADATA}", self.info
             )
             self._checked = True
         encoded: list[memoryview] = []
-        per_shard = self.facts.chunks
+        per_shard = self.info.chunks
         for shard in range(first // per_shard, -(-stop // per_shard)):
             low, high = max(first - shard * per_shard, 0), min(stop - shard * per_shard, per_shard)
             index = self._index(shard)
-            byte_ranges: list[Range] = []
+            byte_ranges: list[ByteRange] = []
             for number in range(low, high):
                 start, size = (int(value) for value in index[number])
-                if MISSING in (start, size) or start + size > self.facts.shards[shard]:
+                if MISSING in (start, size) or start + size > self.info.shards[shard]:
                     raise self._damaged(shard * per_shard + number, "is not there")
                 byte_ranges.append((start, size))
             encoded += self.store.ranges(self._key(shard), byte_ranges)
@@ -101,12 +101,12 @@ class ShardedArray:
         ):
             raise self._damaged(number, "its checksum is wrong")
         _, _, _, _, decoded, _, size = HEADER.unpack_from(body)
-        if decoded != self.facts.chunk_bytes or size != len(body):
-            raise self._damaged(number, f"expands to {decoded} bytes instead of {self.facts.chunk_bytes}")
+        if decoded != self.info.chunk_bytes or size != len(body):
+            raise self._damaged(number, f"expands to {decoded} bytes instead of {self.info.chunk_bytes}")
         scratch = getattr(self._scratch, "chunk", None)
         if scratch is None:
-            shape = (self.facts.chunk, self.facts.width) if self.facts.width else (self.facts.chunk,)
-            scratch = self._scratch.chunk = np.empty(shape, np.dtype(self.facts.dtype).newbyteorder("<"))
+            shape = (self.info.chunk, self.info.width) if self.info.width else (self.info.chunk,)
+            scratch = self._scratch.chunk = np.empty(shape, np.dtype(self.info.dtype).newbyteorder("<"))
         try:
             blosc.decompress(body, scratch)
         except Exception as error:  # RuntimeError, and others of the wrapper
@@ -115,9 +115,9 @@ class ShardedArray:
 
     def read(self, first: int, stop: int) -> npt.NDArray[Any]:
         """Rows ``first`` to ``stop``."""
-        width = (self.facts.width,) if self.facts.width else ()
-        rows = np.empty((max(0, stop - first), *width), self.facts.dtype)
-        chunk = self.facts.chunk
+        width = (self.info.width,) if self.info.width else ()
+        rows = np.empty((max(0, stop - first), *width), self.info.dtype)
+        chunk = self.info.chunk
         numbers = self.chunks_of_rows(first, stop)
         for number, encoded in zip(numbers, self.fetch(numbers.start, numbers.stop), strict=True):
             low, high = max(first, number * chunk), min(stop, (number + 1) * chunk)
@@ -131,9 +131,9 @@ class ShardedArray:
         cached = self._indices.get(shard)
         if cached is not None:
             return cached
-        size, length = self.facts.shards[shard], 16 * self.facts.chunks + CHECKSUM
+        size, length = self.info.shards[shard], 16 * self.info.chunks + CHECKSUM
         if size < length:
-            raise FaceDiffError(f"{self.store.source}/{self._key(shard)}: is shorter than its own index; {DAMAGED}")
+            raise FaceDiffError(f"{self.store.source}/{self._key(shard)}: is shorter than its index; {DAMAGED}")
         (content,) = self.store.ranges(self._key(shard), [(size - length, length)])
         body = bytes(content[:-CHECKSUM])
         if self._codecs[1].value(body) != int.from_bytes(content[-CHECKSUM:], "little"):
@@ -145,10 +145,10 @@ class ShardedArray:
         return index
 
     def _key(self, shard: int) -> str:
-        return f"{self.name}/{shard_key(shard, self.facts.width)}"
+        return f"{self.name}/{shard_key(shard, self.info.width)}"
 
     def _place(self, number: int) -> str:
-        shard, inner = divmod(number, self.facts.chunks)
+        shard, inner = divmod(number, self.info.chunks)
         return f"{self.store.source}/{self._key(shard)}: chunk {inner}"
 
     def _damaged(self, number: int, what: str) -> FaceDiffError:
@@ -161,14 +161,14 @@ def shard_key(shard: int, width: int) -> str:
 
 
 def chunks_of(rows: Sequence[int], chunk: int) -> dict[int, list[tuple[int, int]]]:
-    """For each chunk its requested rows, in order, with their place in the result.
+    """For each chunk its requested rows, in order, with their number in the result.
 
     Example:
         >>> chunks_of(range(24, 27), 25)
         {0: [(24, 0)], 1: [(0, 1), (1, 2)]}
     """
-    places_by_chunk: dict[int, list[tuple[int, int]]] = {}
-    for place, row in enumerate(rows):
-        number, inner = divmod(row, chunk)
-        places_by_chunk.setdefault(number, []).append((inner, place))
-    return places_by_chunk
+    rows_by_chunk: dict[int, list[tuple[int, int]]] = {}
+    for number, row in enumerate(rows):
+        chunk_number, inner = divmod(row, chunk)
+        rows_by_chunk.setdefault(chunk_number, []).append((inner, number))
+    return rows_by_chunk

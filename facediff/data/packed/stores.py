@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from facediff.data.packed.layout import DAMAGED, METADATA, STATE
-from facediff.errors import FaceDiffError, needs_extra
+from facediff.errors import FaceDiffError, damaged, needs_extra
 from facediff.utils.files import atomic, cache_dir
-from facediff.utils.limits import brief
+from facediff.utils.ranges import Range
 
 VARIABLE = "FACEDIFF_PACKED_CACHE_GB"
 USUAL_GB = 50.0
 """Default size of the cache in gigabytes."""
 ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::|://)")
 
-Range = tuple[int, int]
+ByteRange = tuple[int, int]
 """First byte and number of bytes."""
 
 
@@ -43,7 +43,7 @@ def address_of(source: str | Path) -> str | None:
 
 
 def is_packed(source: str | Path) -> bool:
-    """Whether a corpus is packed: an address, or a folder with the metadata of Zarr (or whose packing has begun)."""
+    """Whether a corpus is packed: an address, or a folder with the metadata of Zarr or the state of a packing."""
     if address_of(source) is not None:
         return True
     folder = Path(source).expanduser()
@@ -58,7 +58,7 @@ class ByteStore(Protocol):
     def whole(self, key: str) -> bytes:
         """All bytes of a small object."""
 
-    def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
+    def ranges(self, key: str, byte_ranges: Sequence[ByteRange]) -> list[memoryview]:
         """Some ranges of an object."""
 
 
@@ -82,22 +82,17 @@ class LocalStore:
     def whole(self, key: str) -> bytes:
         """All bytes of a file."""
         path = self.root / key
-        try:
+        with damaged(f"{path}: cannot be read", DAMAGED, OSError):
             return path.read_bytes()
-        except OSError as error:
-            raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {DAMAGED}") from error
 
-    def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
+    def ranges(self, key: str, byte_ranges: Sequence[ByteRange]) -> list[memoryview]:
         """Ranges of a file, those that follow one another in one read."""
         path = self.root / key
         parts: list[memoryview] = []
-        try:
-            with path.open("rb", buffering=0) as stream:
-                for run in runs(byte_ranges):
-                    stream.seek(run[0][0])
-                    parts += split(stream.read(sum(size for _, size in run)), run, path)
-        except OSError as error:
-            raise FaceDiffError(f"{path}: cannot be read ({error.strerror}); {DAMAGED}") from error
+        with damaged(path, DAMAGED, OSError), path.open("rb", buffering=0) as stream:
+            for run in runs(byte_ranges):
+                stream.seek(run[0][0])
+                parts += split(stream.read(sum(size for _, size in run)), run, path)
         return parts
 
 
@@ -124,7 +119,7 @@ class RemoteStore:
         """All bytes of an object."""
         return self._fetch(key, None, None)
 
-    def ranges(self, key: str, byte_ranges: Sequence[Range]) -> list[memoryview]:
+    def ranges(self, key: str, byte_ranges: Sequence[ByteRange]) -> list[memoryview]:
         """Ranges of an object: from the cache, or fetched, with neighbours in one request."""
         parts = {byte_range: part for byte_range in byte_ranges if (part := self._cached(key, byte_range)) is not None}
         for run in runs([byte_range for byte_range in dict.fromkeys(byte_ranges) if byte_range not in parts]):
@@ -134,10 +129,10 @@ class RemoteStore:
                 self._keep(key, byte_range, part)
         return [parts[byte_range] for byte_range in byte_ranges]
 
-    def _file(self, folder: Path, key: str, byte_range: Range) -> Path:
+    def _file(self, folder: Path, key: str, byte_range: ByteRange) -> Path:
         return folder / key.replace("/", ".") / f"{byte_range[0]}-{byte_range[1]}"
 
-    def _cached(self, key: str, byte_range: Range) -> memoryview | None:
+    def _cached(self, key: str, byte_range: ByteRange) -> memoryview | None:
         if self.cache is None:
             return None
         try:
@@ -146,7 +141,7 @@ class RemoteStore:
             return None
         return memoryview(content) if len(content) == byte_range[1] else None
 
-    def _keep(self, key: str, byte_range: Range, content: memoryview) -> None:
+    def _keep(self, key: str, byte_range: ByteRange, content: memoryview) -> None:
         if self.cache is not None:
             try:
                 with atomic(self._file(self.cache, key, byte_range)) as temporary:
@@ -155,14 +150,10 @@ class RemoteStore:
                 self.cache = None
 
     def _fetch(self, key: str, start: int | None, end: int | None) -> bytes:
-        try:
-            system = self._connected()
-            content: bytes = system.cat_file(f"{self._base}/{key}", start=start, end=end)
-        except Exception as error:  # every file system has its own exceptions
-            raise FaceDiffError(
-                f"{self.source}/{key}: cannot be read ({brief(error)}); check the address, the connection and your "
-                f"access to it, and install what fsspec names"
-            ) from error
+        remedy = "check the address, the connection and your access to it, and install the package that fsspec names"
+        # Every file system has its own exceptions.
+        with damaged(f"{self.source}/{key}: cannot be read", remedy, Exception):
+            content: bytes = self._connected().cat_file(f"{self._base}/{key}", start=start, end=end)
         return content
 
     def _connected(self) -> Any:  # noqa: ANN401 - fsspec has no types
@@ -175,14 +166,14 @@ class RemoteStore:
         return self._system
 
 
-def runs(byte_ranges: Sequence[Range]) -> list[list[Range]]:
-    """Groups of adjacent ranges, which one read or request can fetch.
+def runs(byte_ranges: Sequence[ByteRange]) -> list[list[ByteRange]]:
+    """Groups of adjacent ranges, each fetched by one read or request.
 
     Example:
         >>> runs([(0, 4), (4, 2), (9, 1)])
         [[(0, 4), (4, 2)], [(9, 1)]]
     """
-    groups: list[list[Range]] = []
+    groups: list[list[ByteRange]] = []
     for byte_range in byte_ranges:
         if groups and sum(groups[-1][-1]) == byte_range[0]:
             groups[-1].append(byte_range)
@@ -191,7 +182,7 @@ def runs(byte_ranges: Sequence[Range]) -> list[list[Range]]:
     return groups
 
 
-def split(content: bytes, run: Sequence[Range], source: object) -> list[memoryview]:
+def split(content: bytes, run: Sequence[ByteRange], source: object) -> list[memoryview]:
     """The bytes of a run of ranges, one view for each."""
     if len(content) != sum(size for _, size in run):
         raise FaceDiffError(
@@ -217,23 +208,16 @@ def cache_folder(identity: str, size: int) -> Path | None:
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
-        others = sorted(folder.parents[1].glob("*/chunks"), key=lambda other: other.stat().st_mtime)
-        sizes = {other: sum(file.stat().st_size for file in other.rglob("*") if file.is_file()) for other in others}
-        used = sum(kept for other, kept in sizes.items() if other != folder) + size
-        for other in others:
-            if used > limit and other != folder:
-                shutil.rmtree(other, ignore_errors=True)
-                used -= sizes[other]
+        caches = sorted(folder.parents[1].glob("*/chunks"), key=lambda cache: cache.stat().st_mtime)
+        sizes = {cache: sum(file.stat().st_size for file in cache.rglob("*") if file.is_file()) for cache in caches}
+        total = sum(sizes.values()) - sizes[folder] + size
+        for cache in caches:
+            if total > limit and cache != folder:
+                shutil.rmtree(cache, ignore_errors=True)
+                total -= sizes[cache]
     return folder
 
 
-def limit_bytes(variable: str, usual: float) -> float:
-    """Size limit of a cache in bytes: an environment variable's gigabytes, or else the usual ones."""
-    text = os.environ.get(variable, str(usual))
-    try:
-        limit = float(text)
-    except ValueError:
-        limit = -1.0
-    if not 0 <= limit < float("inf"):
-        raise FaceDiffError(f"{variable}={text}: not a valid size; expected gigabytes, 0 to keep nothing")
-    return limit * 1e9
+def limit_bytes(variable: str, default: float) -> float:
+    """Size limit of a cache in bytes: gigabytes of an environment variable, or else the default; 0 keeps nothing."""
+    return 1e9 * Range(0, 1e9).read(variable, os.environ.get(variable, str(default)))

@@ -12,7 +12,6 @@ from facediff.data.corpus import read_templates
 from facediff.data.manifest import read_manifest
 from facediff.data.packed.layout import EXACT
 from facediff.data.packed.reader import PackedCorpus
-from facediff.errors import FaceDiffError
 from facediff.speech.audio import write_wav
 from facediff.utils.batch import do_all
 from facediff.utils.checksums import describe_files
@@ -48,8 +47,8 @@ def unpack(
         for name in ("vertices_npy", "wav"):
             (folder / name).mkdir(exist_ok=True)
         work = PerWorker(partial(_clip_writer, str(source), folder))
-        places = {"workers": workers, "scheduler": scheduler, "writes": folder, "reads": packed.places}
-        do_all(work, packed.names(), **places, progress="" if quiet else "unpacking")
+        options = {"workers": workers, "scheduler": scheduler, "writes": folder, "reads": packed.folders}
+        do_all(work, packed.names(), **options, progress="" if quiet else "unpacking")
         _correct_manifest(folder, packed, workers)
     return len(packed.names())
 
@@ -64,8 +63,6 @@ def _clip_writer(source: str, folder: Path) -> Any:  # noqa: ANN401 - a partial
 
 def _write_clip(packed: PackedCorpus, folder: Path, templates: dict[str, Any], name: str) -> None:
     clip, motion = packed.record.clips[name], packed.open(name)
-    if clip.identity not in templates:
-        raise FaceDiffError(f"{packed.source}: no template of {clip.identity}, needed by clip {name}; pack it again")
     if clip.coding in EXACT:
         vertices = motion.vertices()
     else:
@@ -87,15 +84,11 @@ def _correct_manifest(folder: Path, packed: PackedCorpus, workers: int | None) -
     if not isinstance(files, dict):
         return
     # An untrusted manifest may name files outside the folder: only files that were just written are described.
-    ours = {*packed.record.files, *(name for clip in packed.names() for name in _places(clip))}
-    there = [name for name in files if name in ours]
-    written = describe_files(folder, there, workers=workers or processors(), progress="")
+    clips = {file for clip in packed.names() for file in (f"vertices_npy/{clip}.npy", f"wav/{clip}.wav")}
+    names = [name for name in files if name in packed.record.files or name in clips]
+    written = describe_files(folder, names, workers=workers or processors(), progress="")
     if written != files:
-        changed = {name: facts for name, facts in written.items() if facts != files.get(name)}
+        changed = {name: info for name, info in written.items() if info != files.get(name)}
         manifest["files"] = {**files, **written}
         manifest["packed"] = {"tolerance_mm": packed.record.tolerance, "changed": len(changed)}
         write_json(folder / "manifest.json", manifest)
-
-
-def _places(clip: str) -> tuple[str, str]:
-    return f"vertices_npy/{clip}.npy", f"wav/{clip}.wav"

@@ -10,7 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.corpus import LIP_PAIRS, MOTION_FOLDERS, find_region, read_manifest, read_templates
-from facediff.data.person.motion import MESHES, Array, Faces, FaceSequence, differing_faces, scratch_array, spans
+from facediff.data.person.face_sequences import (
+    MESHES,
+    Array,
+    Faces,
+    FaceSequence,
+    differing_faces,
+    scratch_array,
+    spans,
+)
 from facediff.data.track.face import pair_distances
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
@@ -79,11 +87,12 @@ def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> Ta
 
 
 def _frame_rate(root: Path, recorded: float | None, option: float | None) -> float:
-    if recorded is None and option is None:
-        raise FaceDiffError(f"{root}: has no manifest.json with its frame rate; add --corpus-frame-rate")
-    if recorded is not None and option is not None and abs(recorded - option) > 1e-6:
-        raise FaceDiffError(f"--corpus-frame-rate {option:g}: {root / 'manifest.json'} has {recorded:g}; omit it")
-    return float(recorded or option or 0)
+    if (rate := recorded or option) is None or abs(rate - (option or rate)) > 1e-6:
+        raise FaceDiffError(
+            f"--corpus-frame-rate {option or 'is missing'}: {root / 'manifest.json'} has {recorded or 'none'}; "
+            f"expected the frame rate of the corpus in one of them"
+        )
+    return float(rate)
 
 
 def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
@@ -101,8 +110,7 @@ def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
     """Whether faces could be compared with the corpus's; an error if they differ."""
     if faces is None or target.faces is None:
         return False
-    differing = differing_faces(faces, target.faces)
-    if differing:
+    if differing := differing_faces(faces, target.faces):
         raise FaceDiffError(
             f"{path}: {differing} triangles are not those of the mesh in {target.root}, so the topology differs; if "
             f"only polygons were triangulated differently, give the motion as a .npy array, which has no faces"
@@ -209,8 +217,8 @@ def _head_motion(rotations: Array, translations: Array, centre: Array) -> tuple[
     mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     # |R - M|² = 8 sin²(angle / 2): exact for small angles too, where the arc cosine of the trace is not.
     chord = np.sqrt(np.square(rotations - mean).sum(axis=(1, 2)))
-    places = np.einsum("tji,tj->ti", rotations, centre - translations)
-    return 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0)), np.linalg.norm(places - places.mean(0), axis=1)
+    centres = np.einsum("tji,tj->ti", rotations, centre - translations)
+    return 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0)), np.linalg.norm(centres - centres.mean(0), axis=1)
 
 
 def _speed(frames: npt.NDArray[np.floating]) -> Array:
@@ -268,12 +276,11 @@ def choose_neutral(
     covered = max(1, min(len(stabilised.frames), round(len(speech) / SAMPLE_RATE * frame_rate)))
     gaps = None if lip_pairs is None else pair_distances(stabilised.frames[:covered], lip_pairs)
     closed = CLOSED * face_size(stabilised.face)
-    loud, speed = loudness(speech, covered, frame_rate), stabilised.speed[:covered]
-    chosen = neutral_frames(loud, speed, gaps, closed).tolist()
-    face = np.median(stabilised.frames[chosen], axis=0).astype(np.float64)
+    frames = neutral_frames(loudness(speech, covered, frame_rate), stabilised.speed[:covered], gaps, closed).tolist()
+    face = np.median(stabilised.frames[frames], axis=0).astype(np.float64)
     mouth = "" if gaps is None else ", with the mouth closed,"
-    source = f"median of {len(chosen)} silent and still frames{mouth} (counted from 0): {spans(chosen)}"
-    return NeutralFace(face, unmoved, source, chosen)
+    source = f"median of {len(frames)} silent and still frames{mouth} (counted from 0): {spans(frames)}"
+    return NeutralFace(face, unmoved, source, frames)
 
 
 def _onto_template(stabilised: StabilisedMotion, template: TemplateFile) -> Similarity:
@@ -332,8 +339,7 @@ def neutral_frames(loud: Array, speed: Array, gaps: Array | None = None, closed:
         closed: gap of closed lips; frames with a larger one count only among the smallest tenth.
     """
     frames = np.arange(len(loud)) if gaps is None else np.flatnonzero(gaps <= max(closed, np.quantile(gaps, 0.1)))
-    worse = np.maximum(*(np.searchsorted(np.sort(values), values) for values in (loud[frames], speed[frames])))
-    least, most = NEUTRAL_FRAMES
+    ranks = np.maximum(*(np.searchsorted(np.sort(values), values) for values in (loud[frames], speed[frames])))
     share = NEUTRAL_SHARE if gaps is None else CLOSED_SHARE
-    count = min(len(frames), max(least, min(most, round(share * len(frames)))))
-    return np.sort(frames[np.argsort(worse, kind="stable")[:count]])
+    count = min(len(frames), int(np.clip(round(share * len(frames)), *NEUTRAL_FRAMES)))
+    return np.sort(frames[np.argsort(ranks, kind="stable")[:count]])

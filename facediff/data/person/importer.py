@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.manifest import FORMAT
+from facediff.data.person.face_sequences import Array, FaceSequence, read_motion, scratch_array
 from facediff.data.person.fitting import (
     NeutralFace,
     Speech,
@@ -29,10 +29,9 @@ from facediff.data.person.fitting import (
     read_template,
     stabilise,
 )
-from facediff.data.person.motion import Array, FaceSequence, read_motion, scratch_array
-from facediff.data.prepare.motion import resample_frames, resampled_length
-from facediff.data.prepare.runner import MANIFEST, version, write_clip, write_templates
-from facediff.errors import FaceDiffError, counted
+from facediff.data.preparation import MANIFEST, version, write_clip, write_templates
+from facediff.data.reconstructions import resample_frames, resampled_length
+from facediff.errors import FaceDiffError, counted, damaged
 from facediff.mesh import Similarity, stable_vertices
 from facediff.mesh.alignment import chunks
 from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
@@ -85,14 +84,9 @@ def import_person(
     Returns:
         the report of the import.
     """
-    output = output.expanduser().absolute()
-    if not NAME.fullmatch(name):
-        raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
-    check_output(output)
+    output = check_entry(name, output)
     target = read_target_corpus(corpus, name=name, frame_rate=corpus_frame_rate)
-    speech = read_speech(audio)
-    if float(np.abs(speech).max()) < SILENCE:
-        raise FaceDiffError(f"{audio}: holds only silence; expected the speech of the video")
+    speech = read_entry_speech(audio)
     with scratch_folder(output) as scratch:
         read = read_motion(
             motion,
@@ -104,9 +98,9 @@ def import_person(
         )
         warnings = _check_lengths(motion, audio, len(speech), len(read.frames), frame_rate)
         fitted = _fit(motion, read, target, speech, frame_rate, scratch, template=template, stable=stable, scale=scale)
-        frames, way = fitted.stabilised.frames, fitted.neutral.placing.then(fitted.place)
+        frames, to_corpus = fitted.stabilised.frames, fitted.neutral.placing.then(fitted.to_corpus)
         for part, chunk in chunks(frames):
-            frames[part] = way.apply(chunk)
+            frames[part] = to_corpus.apply(chunk)
         if frame_rate != target.frame_rate:
             length = resampled_length(len(frames), frame_rate, target.frame_rate)
             resampled = scratch_array(scratch / "rate.npy", (length, *frames.shape[1:]))
@@ -115,7 +109,7 @@ def import_person(
         mismatch = len(speech) / SAMPLE_RATE - len(read.frames) / frame_rate
         report = _report(name, read, target, fitted, clips, frame_rate, stable, mismatch, warnings)
         entry = scratch / output.name
-        _write_entry(entry, target, clips, frames, speech, fitted.place.apply(fitted.neutral.face), report)
+        _write_entry(entry, target, clips, frames, speech, fitted.to_corpus.apply(fitted.neutral.face), report)
         put_in_place(entry, output, replace=False)
     return report
 
@@ -126,7 +120,7 @@ class FittedSpeaker:
 
     stabilised: StabilisedMotion  # frames without head motion, still in the motion's coordinates
     neutral: NeutralFace
-    place: Similarity  # from the neutral face's coordinates to the corpus's
+    to_corpus: Similarity  # from the neutral face's coordinates to the corpus's
     measured_scale: float  # scale of the best similarity between the neutral face and the corpus's mean face
     residual: float  # what that similarity leaves, as a share of the face's size
     faces_compared: bool
@@ -145,32 +139,42 @@ def _fit(
     scale: float | None,
 ) -> FittedSpeaker:
     """Remove the head's motion, find the neutral face, and find the way into the corpus's coordinates."""
-    own_template = None if template is None else read_template(template, target)
-    chosen = None if stable is None else read_stable(stable, target.n_vertices)
+    template_file = None if template is None else read_template(template, target)
+    skull = None if stable is None else read_stable(stable, target.n_vertices)
     compared = check_faces(motion, read.faces, target)
-    with _naming(motion):
+    with damaged(motion, "get the motion again"):
         for _ in chunks(read.frames):
             pass  # refuses frames that are not finite
-        still = stable_vertices(read.frames) if chosen is None else chosen
+        still = stable_vertices(read.frames) if skull is None else skull
         face = middle_face(read, still)
         lay_onto_corpus(motion, face, target)  # another topology is refused before the long work
         stabilised = stabilise(read, face, still, scratch / "stable.npy")
     source = template or motion
-    with _naming(source):
-        neutral = choose_neutral(read, stabilised, own_template, speech, frame_rate, target.lip_pairs)
+    with damaged(source, "choose another neutral face"):
+        neutral = choose_neutral(read, stabilised, template_file, speech, frame_rate, target.lip_pairs)
         best, residual = lay_onto_corpus(source, neutral.face, target)
-    place = into_coordinates(neutral.face, best, scale)
-    return FittedSpeaker(stabilised, neutral, place, best.scale, residual, compared)
+    to_corpus = into_coordinates(neutral.face, best, scale)
+    return FittedSpeaker(stabilised, neutral, to_corpus, best.scale, residual, compared)
 
 
-def check_output(path: Path) -> None:
-    """Refuse, before any work is done, a folder that is not empty or cannot be made."""
-    if path.exists() and not path.is_dir():
-        raise FaceDiffError(f"{path}: is a file; expected the name of a new folder")
-    if path.is_dir() and any(path.iterdir()):
-        raise FaceDiffError(f"{path}: is not empty; choose a new folder, or remove this one")
+def check_entry(name: str, output: Path) -> Path:
+    """The folder of an entry; before any work, names of another form and folders that exist are refused."""
+    path = output.expanduser().absolute()
+    if not NAME.fullmatch(name):
+        raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FaceDiffError(f"{path}: is a file or not empty; choose a new folder, or remove this one")
     check_writable(path / "manifest.json")
     check_writable(path.with_name(f".{path.name}.probe"))
+    return path
+
+
+def read_entry_speech(path: Path) -> Speech:
+    """The speech of a video or a sound file; silence is refused."""
+    speech = read_speech(path)
+    if float(np.abs(speech).max(initial=0.0)) < SILENCE:
+        raise FaceDiffError(f"{path}: holds only silence; expected the speech of the video")
+    return speech
 
 
 def _check_lengths(motion: Path, audio: Path, samples: int, frames: int, frame_rate: float) -> list[str]:
@@ -181,24 +185,15 @@ def _check_lengths(motion: Path, audio: Path, samples: int, frames: int, frame_r
         f"{sound_seconds:.2f} s"
     )
     difference = abs(sound_seconds - motion_seconds)
-    if difference > MISMATCH * max(sound_seconds, motion_seconds):
-        raise FaceDiffError(f"{motion} and {audio}: {lengths}; expected the same stretch of video; check --frame-rate")
-    if min(sound_seconds, motion_seconds) < MIN_SECONDS:
-        raise FaceDiffError(f"{motion}: {lengths}; expected at least {MIN_SECONDS:g} s, and better about a minute")
+    too_different = difference > MISMATCH * max(sound_seconds, motion_seconds)
+    if too_different or min(sound_seconds, motion_seconds) < MIN_SECONDS:
+        raise FaceDiffError(
+            f"{motion} and {audio}: {lengths}; expected the same stretch of video; check --frame-rate, and record at "
+            f"least {MIN_SECONDS:g} s"
+        )
     if difference > 2 / frame_rate + 0.1:
         return [f"{lengths}; the end of the longer one is left out"]
     return []
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Put a path in front of the messages of errors that do not name a file."""
-    try:
-        yield
-    except FaceDiffError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise FaceDiffError(f"{path}: {error}") from error
 
 
 # Cutting into clips.
@@ -293,6 +288,7 @@ class ImportReport:
             unit: the corpus's unit of length; "corpus units" if None.
         """
         of = unit or "corpus units"
+        clips = counted(self.clips, "clip")
         splits = ", ".join(f"{count} {split}" for split, count in self.splits.items())
         compared = "triangles equal" if self.faces_compared else "triangles not compared"
         stable = f"{self.stable_vertices} vertices {self.stable_source}, which jitter by {self.jitter:.3g} {of} RMS"
@@ -312,11 +308,7 @@ class ImportReport:
                 "sound and motion",
                 f"sound is {abs(self.mismatch):.2f} s {'longer' if self.mismatch >= 0 else 'shorter'}",
             ),
-            (
-                "written",
-                f"{counted(self.clips, 'clip')} ({splits}), {self.frames_written} frames at "
-                f"{self.corpus_frame_rate:g}/s",
-            ),
+            ("written", f"{clips} ({splits}), {self.frames_written} frames at {self.corpus_frame_rate:g}/s"),
         ]
         return [
             *(f"{title:<21}{text}" for title, text in rows),
@@ -336,7 +328,7 @@ def _report(
     mismatch: float,
     warnings: list[str],
 ) -> ImportReport:
-    stabilised, scale = fitted.stabilised, fitted.place.scale
+    stabilised, scale = fitted.stabilised, fitted.to_corpus.scale
     return ImportReport(
         name=name,
         frames=len(read.frames),
@@ -390,12 +382,12 @@ def _write_entry(
         part = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)
         write_clip(folder, clip.name, frames[clip.start : clip.stop], part)
     write_templates(folder / "templates.pkl", {report.name: template.astype(np.float32)})
-    facts = {"frame_rate": target.frame_rate, "n_vertices": target.n_vertices, "unit": target.unit}
-    write_record(folder, report.name, clips, facts, asdict(report))
+    fields = {"frame_rate": target.frame_rate, "n_vertices": target.n_vertices, "unit": target.unit}
+    write_entry_manifest(folder, report.name, clips, fields, asdict(report))
 
 
-def write_record(
-    folder: Path, name: str, clips: Sequence[EntryClip], facts: Mapping[str, object], report: Mapping[str, object]
+def write_entry_manifest(
+    folder: Path, name: str, clips: Sequence[EntryClip], fields: Mapping[str, object], report: Mapping[str, object]
 ) -> None:
     """Write the table of an entry's clips and, when all other files are there, its manifest."""
     rows = [
@@ -403,5 +395,5 @@ def write_record(
         for clip in clips
     ]
     write_rows(folder / "clips.csv", rows, line_end="\n")
-    about = {"facediff": version(), "format": FORMAT, "corpus": "person", "person": name, **facts, "report": report}
+    about = {"facediff": version(), "format": FORMAT, "corpus": "person", "person": name, **fields, "report": report}
     write_json(folder / MANIFEST, {**about, "files": describe_files(folder, workers=2)})

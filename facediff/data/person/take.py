@@ -9,15 +9,22 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.person.fitting import loudness
-from facediff.data.person.importer import MIN_SECONDS, NAME, SILENCE, EntryClip, check_output, cut, write_record
-from facediff.data.prepare.runner import write_speech
+from facediff.data.person.importer import (
+    MIN_SECONDS,
+    EntryClip,
+    check_entry,
+    cut,
+    read_entry_speech,
+    write_entry_manifest,
+)
+from facediff.data.preparation import write_speech
 from facediff.errors import FaceDiffError, counted
 from facediff.spaces.files import ParameterClip, even, read_parameters
 from facediff.spaces.files.tables import write_live_link
-from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech
+from facediff.speech.audio import SAMPLE_RATE, fit_length
 from facediff.utils import ranges
+from facediff.utils.cross_correlation import correlations, lagged_correlation, peak
 from facediff.utils.files import put_in_place, scratch_folder
-from facediff.utils.lags import correlations, lagged_correlation, peak
 
 Array = npt.NDArray[np.float64]
 Speech = npt.NDArray[np.float32]
@@ -25,8 +32,8 @@ Speech = npt.NDArray[np.float32]
 STEPS = 200.0
 """Times a second at which loudness and the mouth's opening are compared."""
 LEAD = 0.012
-"""Seconds by which a mouth opens before it is heard: the mean of 26 speakers of the built-in corpus, whose sound and
-motion are in step, with 24 to 60 s of each (standard deviation 0.008)."""
+"""Seconds by which a mouth opens before it is heard: the mean of 26 speakers of the built-in corpus, with sound
+and motion in step and 24 to 60 s of each (standard deviation 0.008)."""
 SMOOTHING = 0.05
 """Seconds over which loudness is averaged."""
 LEAST_SECONDS = 1.0
@@ -77,7 +84,7 @@ class TakeReport:
 
 
 def mouth_opening(clip: ParameterClip) -> Array:
-    """How far the mouth is open (T,): the jaw's opening without what the lips close of it, as ARKit has mouthClose."""
+    """How far the mouth is open (T,): the jaw's opening less the closing of the lips, ARKit's mouthClose."""
     jaw, close = (clip.values[:, clip.space.index(name)].astype(np.float64) for name in ("jawOpen", "mouthClose"))
     return np.asarray(jaw - close)
 
@@ -95,11 +102,16 @@ def find_offset(opening: Array, frame_rate: float, speech: Speech, most_seconds:
         speech: (S,) at 16 kHz.
         most_seconds: largest offset to consider, either way.
     """
-    steps = int(len(opening) / frame_rate * STEPS)
-    mouth = np.interp(np.arange(steps) / STEPS, np.arange(len(opening)) / frame_rate, opening)
-    loud = loudness(speech, int(len(speech) / SAMPLE_RATE * STEPS), STEPS, smoothing=SMOOTHING)
+    loud, mouth = _series(opening, frame_rate, speech)
     scores = correlations(loud, mouth, round(most_seconds * STEPS), round(LEAST_SECONDS * STEPS))
     return Offset((peak(scores) + 0.5) / STEPS - LEAD, float(max(scores.max(), -1.0)), found=True)
+
+
+def _series(opening: Array, frame_rate: float, speech: Speech) -> tuple[Array, Array]:
+    """Loudness and the mouth's opening at :data:`STEPS`."""
+    steps = int(len(opening) / frame_rate * STEPS)
+    mouth = np.interp(np.arange(steps) / STEPS, np.arange(len(opening)) / frame_rate, opening)
+    return loudness(speech, int(len(speech) / SAMPLE_RATE * STEPS), STEPS, smoothing=SMOOTHING), mouth
 
 
 @ranges.checked
@@ -124,16 +136,11 @@ def import_take(
         most_offset: largest offset to look for, either way.
         clip_seconds: approximate length of the clips.
     """
-    output = output.expanduser().absolute()
-    if not NAME.fullmatch(name):
-        raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
-    check_output(output)
+    output = check_entry(name, output)
     recorded = read_parameters(take)
     if recorded.layout != "live_link":
         raise FaceDiffError(f"{take}: is no recording of Live Link Face; expected its .csv with a timecode")
-    speech = read_speech(sound)
-    if float(np.abs(speech).max(initial=0.0)) < SILENCE:
-        raise FaceDiffError(f"{sound}: holds only silence; expected the sound of the take")
+    speech = read_entry_speech(sound)
     clip = even(recorded)
     warnings = []
     if offset is None:
@@ -144,8 +151,11 @@ def import_take(
                 f"result, or state the offset with --offset"
             )
     else:
-        best = Offset(offset, _at(clip, speech, offset), found=False)
-    # Frames whose time lies in the sound; the sound begins with the first of them.
+        loud, mouth = _series(mouth_opening(clip), clip.frame_rate, speech)
+        lag = round((offset + LEAD) * STEPS - 0.5)
+        correlation = max(lagged_correlation(loud, mouth, lag, round(LEAST_SECONDS * STEPS)), -1.0)
+        best = Offset(offset, correlation, found=False)
+    # Frames within the sound; the sound begins with the first of them.
     times = best.seconds + np.arange(len(clip.values)) / clip.frame_rate
     inside = np.flatnonzero((times >= 0) & (times <= len(speech) / SAMPLE_RATE - 1 / clip.frame_rate))
     if len(inside) < MIN_SECONDS * clip.frame_rate:
@@ -175,16 +185,6 @@ def import_take(
     return report
 
 
-def _at(clip: ParameterClip, speech: Speech, offset: float) -> float:
-    """The correlation at a stated offset."""
-    steps = int(len(clip.values) / clip.frame_rate * STEPS)
-    opening = mouth_opening(clip)
-    mouth = np.interp(np.arange(steps) / STEPS, np.arange(len(opening)) / clip.frame_rate, opening)
-    loud = loudness(speech, int(len(speech) / SAMPLE_RATE * STEPS), STEPS, smoothing=SMOOTHING)
-    lag = round((offset + LEAD) * STEPS - 0.5)
-    return max(lagged_correlation(loud, mouth, lag, round(LEAST_SECONDS * STEPS)), -1.0)
-
-
 def _write(folder: Path, clip: ParameterClip, speech: Speech, entries: list[EntryClip], report: TakeReport) -> None:
     (folder / FOLDER).mkdir(parents=True)
     # 16-bit sound ends at full scale: a recording that goes beyond is turned down as a whole.
@@ -194,4 +194,4 @@ def _write(folder: Path, clip: ParameterClip, speech: Speech, entries: list[Entr
         write_live_link(folder / FOLDER / f"{entry.name}.csv", part)
         first, stop = (round(frame / clip.frame_rate * SAMPLE_RATE) for frame in (entry.start, entry.stop))
         write_speech(folder / "wav" / f"{entry.name}.wav", speech[first:stop])
-    write_record(folder, report.name, entries, {"layout": "live_link"}, asdict(report))
+    write_entry_manifest(folder, report.name, entries, {"layout": "live_link"}, asdict(report))

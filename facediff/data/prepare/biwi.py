@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.runner import (
+from facediff.data.preparation import (
     Job,
     Precision,
     PreparationPlan,
@@ -27,7 +27,7 @@ from facediff.data.prepare.runner import (
     find_file,
     find_regions,
     folders_in,
-    nothing_to_prepare,
+    refuse_empty,
     write_clip,
     write_mesh,
     write_templates,
@@ -37,7 +37,7 @@ from facediff.mesh.files import read_mesh
 from facediff.mesh.mesh import surface_area
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
-TRAINING_SUBJECTS = ["F2", "F3", "F4", "M3", "M4", "M5"]
+SEEN = ("F2", "F3", "F4", "M3", "M4", "M5")
 SENTENCES = [f"e{i:02d}" for i in range(1, 41)]
 """The emotional half. The neutral one, 01 to 40, is left out by all published work on this corpus."""
 FRAME_RATE = 25.0
@@ -56,7 +56,7 @@ SOUND_DEPTH = 4  # levels of folders that are searched
 
 FRAME_NAME = re.compile(r"frame_(\d+)\.vl", re.IGNORECASE)
 HEADERS = (4, 8)
-"""Bytes of the count in a frame's file: the authors wrote an "unsigned long", whose width is the platform's."""
+"""Bytes of the count in a frame's file: the authors wrote an "unsigned long", as wide as on their platform."""
 
 Array = npt.NDArray[np.float64]
 
@@ -79,43 +79,47 @@ def plan(
         subjects: only these, e.g. F2,F3,M5; all that are there if not given
         regions: folder with lve.txt and fdd.txt; regions/ of the raw folder if not given
     """
-    chosen = choose_subjects(subjects, SUBJECTS, "BIWI")
+    selected = choose_subjects(subjects, SUBJECTS, "BIWI")
     region_files = find_regions(raw, regions)
-    missing = {
+    gaps = {
         f"regions/{name}": f"expected in a folder given by --regions; the CodeTalker repository has it as "
         f"BIWI/regions/{name}, and facediff may not distribute it"
         for name in REGION_FILES
         if name not in {path.name for path in region_files}
     }
     notes: list[str] = []
-    sequences = _find_sequences(raw, chosen, notes)
-    templates = _find_templates(raw, [subject for subject in chosen if sequences[subject]], missing)
-    sounds = _find_sounds(raw)
+    sequences, sounds = _find_sequences(raw, selected, notes), _find_sounds(raw)
+    templates: dict[str, Path] = {}
     jobs = []
-    for subject in chosen:
+    for subject in selected:
+        template = find_file(raw, f"rigid_scans/{subject}.obj")
         if not sequences[subject]:
-            missing[subject] = f"expected frames in {raw / 'faces' / subject / 'e01'} … e40"
+            gaps[subject] = f"expected frames in {raw / 'faces' / subject / 'e01'} … e40"
             continue
+        if template is None:
+            expected = raw / "rigid_scans" / f"{subject}.obj"
+            gaps[f"template of {subject}"] = f"expected {expected}; no clip of {subject} is written without it"
+        else:
+            templates[subject] = template
         for sentence in SENTENCES:
             name, folder = f"{subject}_{sentence}", sequences[subject].get(sentence)
             if folder is None:
-                missing[name] = f"expected frames in {raw / 'faces' / subject / sentence}"
+                gaps[name] = f"expected frames in {raw / 'faces' / subject / sentence}"
             elif name not in sounds:
-                missing[name] = f"expected its sound, {raw / 'audio' / name}.wav or {raw / 'videos' / name}.flv"
-            elif subject in templates:
-                work = partial(prepare_clip, name, folder, sounds[name], templates[subject], normalise, dtype)
+                gaps[name] = f"expected its sound, {raw / 'audio' / name}.wav or {raw / 'videos' / name}.flv"
+            elif template is not None:
+                work = partial(prepare_clip, name, folder, sounds[name], template, normalise, dtype)
                 jobs.append(Job(name, work, _count_frames(name, folder, notes)))
-    if not jobs:
-        raise nothing_to_prepare(raw, "BIWI", missing)
+    refuse_empty(raw, "BIWI", jobs, gaps)
     return PreparationPlan(
         corpus="biwi",
         frame_rate=FRAME_RATE,
         unit=UNITS[normalise],
         n_vertices=len(read_template(next(iter(templates.values())))[0]),
-        options={"normalise": normalise, "dtype": dtype, "subjects": "all" if subjects is None else chosen},
+        options={"normalise": normalise, "dtype": dtype, "subjects": "all" if subjects is None else selected},
         jobs=jobs,
         shared=partial(_write_shared, templates, normalise, region_files),
-        missing=missing,
+        missing=gaps,
         notes=notes,
     )
 
@@ -137,7 +141,7 @@ def prepare_clip(
                 f"{file}: has {len(frame)} vertices, or NaN among them; expected {len(template)} finite ones as in "
                 f"{template_file}; copy it again, or remove the sequence from {folder.parent}"
             )
-        target[:] = _normalised(frame, faces, normalise, file)
+        target[:] = _normalised(frame, faces, normalise)
     return write_clip(out, name, vertices, read_speech(sound), dtype)
 
 
@@ -156,39 +160,34 @@ def codetalker(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer
 
 
 def _normalised(
-    vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.int32], how: Normalisation, file: Path
+    vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.int32], method: Normalisation
 ) -> npt.NDArray[np.floating]:
-    if how == "none":
-        return vertices
-    with np.errstate(all="ignore"):
-        face = codetalker(vertices, faces)
-    if not np.isfinite(face).all():
-        raise FaceDiffError(f"{file}: has no surface, by which it is normalised; copy it again")
-    return face
+    with np.errstate(all="ignore"):  # NaN is refused when the clip is written
+        return vertices if method == "none" else codetalker(vertices, faces)
 
 
 def _write_shared(
     templates: dict[str, Path], normalise: Normalisation, region_files: Sequence[Path], out: Path
 ) -> list[str]:
     neutral = {
-        subject: np.asarray(_normalised(*read_template(path), normalise, path), np.float64)
+        subject: np.asarray(_normalised(*read_template(path), normalise), np.float64)
         for subject, path in templates.items()
     }
     write_templates(out / "templates.pkl", neutral)
-    drawn = next((subject for subject in TRAINING_SUBJECTS if subject in neutral), next(iter(neutral)))
-    write_mesh(out / MESH_FILE, neutral[drawn], read_template(templates[drawn])[1])
+    speaker = next((subject for subject in SEEN if subject in neutral), next(iter(neutral)))
+    write_mesh(out / MESH_FILE, neutral[speaker], read_template(templates[speaker])[1])
     return ["templates.pkl", MESH_FILE, *copy_files(region_files, out, "regions")]
 
 
 # Finding sequences, templates and sound in the raw folder.
 
 
-def _find_sequences(raw: Path, chosen: Sequence[str], notes: list[str]) -> dict[str, dict[str, Path]]:
+def _find_sequences(raw: Path, subjects: Sequence[str], notes: list[str]) -> dict[str, dict[str, Path]]:
     """Folder of every emotional sequence, by subject and sentence."""
-    sequences: dict[str, dict[str, Path]] = {subject: {} for subject in chosen}
+    sequences: dict[str, dict[str, Path]] = {subject: {} for subject in subjects}
     neutral = 0
     for base in bases(raw):
-        for subject in chosen:
+        for subject in subjects:
             folder = base / "faces" / subject
             for path in folders_in(folder) if folder.is_dir() else ():
                 if path.name in SENTENCES and frame_files(path):
@@ -199,23 +198,11 @@ def _find_sequences(raw: Path, chosen: Sequence[str], notes: list[str]) -> dict[
     return sequences
 
 
-def _find_templates(raw: Path, subjects: Sequence[str], missing: dict[str, str]) -> dict[str, Path]:
-    templates = {}
-    for subject in subjects:
-        path = find_file(raw, f"rigid_scans/{subject}.obj")
-        if path is None:
-            expected = raw / "rigid_scans" / f"{subject}.obj"
-            missing[f"template of {subject}"] = f"expected {expected}; no clip of {subject} is written without it"
-        else:
-            templates[subject] = path
-    return templates
-
-
 def _find_sounds(raw: Path) -> dict[str, Path]:
     """Sound of every clip. A recording cut to the motion is preferred, then any other recording, then a video."""
     ranked: dict[str, tuple[tuple[int, int, str], Path]] = {}
-    for place, folders, files in os.walk(raw, followlinks=True):
-        folder = Path(place)
+    for path_text, folders, files in os.walk(raw, followlinks=True):
+        folder = Path(path_text)
         deep = len(folder.relative_to(raw).parts) >= SOUND_DEPTH
         folders[:] = [] if deep else sorted(name for name in folders if name not in ("faces", "rigid_scans"))
         for path in (folder / file for file in files if not file.startswith(".")):
@@ -230,9 +217,9 @@ def _find_sounds(raw: Path) -> dict[str, Path]:
 def _count_frames(name: str, folder: Path, notes: list[str]) -> int:
     """Frames of a sequence; gaps in their numbers are noted."""
     numbers = list(frame_files(folder))
-    if missing := gaps(numbers):
+    if frames := gaps_in(numbers):
         notes.append(
-            f"{name}: frames {', '.join(missing)} are not in {folder}; it is written without them, so that speech and "
+            f"{name}: frames {', '.join(frames)} are not in {folder}; it is written without them, so that speech and "
             f"motion are no longer synchronous from there on"
         )
     return len(numbers)
@@ -243,18 +230,14 @@ def _count_frames(name: str, folder: Path, notes: list[str]) -> int:
 
 def frame_files(folder: Path) -> dict[int, Path]:
     """The frames of a sequence by number, in numeric order."""
-    named = ((FRAME_NAME.fullmatch(path.name), path) for path in folder.iterdir())
-    return dict(sorted((int(match[1]), path) for match, path in named if match))
+    paths = ((FRAME_NAME.fullmatch(path.name), path) for path in folder.iterdir())
+    return dict(sorted((int(match[1]), path) for match, path in paths if match))
 
 
-def gaps(numbers: list[int]) -> list[str]:
+def gaps_in(numbers: list[int]) -> list[str]:
     """The gaps in a numbering that should begin with 1 (or 0), e.g. ``["5", "9 to 12"]``."""
-    missing = []
-    for before, after in zip([0, *numbers], numbers, strict=False):
-        if after - before > 1:
-            first, last = before + 1, after - 1
-            missing.append(f"{first}" if first == last else f"{first} to {last}")
-    return missing
+    spans = [(a + 1, b - 1) for a, b in zip([0, *numbers], numbers, strict=False) if b - a > 1]
+    return [f"{first}" if first == last else f"{first} to {last}" for first, last in spans]
 
 
 def check_sizes(files: Sequence[Path]) -> None:

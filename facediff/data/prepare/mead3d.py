@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -18,8 +18,7 @@ from typing import Literal, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.motion import read_parameters
-from facediff.data.prepare.runner import (
+from facediff.data.preparation import (
     Job,
     Precision,
     PreparationPlan,
@@ -28,11 +27,12 @@ from facediff.data.prepare.runner import (
     find_file,
     find_regions,
     folders_in,
-    nothing_to_prepare,
+    refuse_empty,
     write_clip,
     write_mesh,
     write_templates,
 )
+from facediff.data.reconstructions import read_parameters
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.mesh.flame import SHAPES, Flame
 from facediff.utils.checksums import sha256
@@ -40,8 +40,6 @@ from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import write_rows
 from facediff.utils.progress import track
 
-EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
-"""In the order of the index in clip names."""
 LEVELS = (1, 2, 3)
 RECONSTRUCTION = "shape_pose_cam.hdf5"
 # The first that is there is used, converted files before MEAD's own.
@@ -64,39 +62,6 @@ MISSING_MASKS = "expected in the raw folder or next to the FLAME model; from fla
 
 Shape = Literal["subject", "clip"]
 Array = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, order=True)
-class MeadRecording:
-    """The parameters of a clip, e.g. ``M003_001_0_0``: speaker, sequence, index of emotion, index of intensity."""
-
-    name: str
-    file: Path
-
-    @property
-    def subject(self) -> str:
-        """The speaker."""
-        return self.name[:4]
-
-    @property
-    def sequence(self) -> str:
-        """Three digits. The same number stands for the same sentence within one emotion only."""
-        return self.name[5:8]
-
-    @property
-    def emotion(self) -> str:
-        """In a word."""
-        return EMOTIONS[int(self.name[9])]
-
-    @property
-    def level(self) -> int:
-        """Intensity, 1 to 3."""
-        return int(self.name[11]) + 1
-
-    @property
-    def sound(self) -> str:
-        """Where MEAD has its sound, below the folder with the speakers."""
-        return f"{self.subject}/audio/{self.emotion}/level_{self.level}/{self.sequence}.m4a"
 
 
 def plan(
@@ -127,44 +92,42 @@ def plan(
     model = load_flame(flame)
     region_files = find_regions(raw, regions)
     distribution = find_recordings(raw)
-    speakers = sorted({recording.subject for recording in distribution.recordings})
-    chosen = choose_subjects(subjects, speakers, "the raw folder")
-    recordings = [recording for recording in distribution.recordings if recording.subject in chosen]
-    missing = {name: text for name, text in distribution.missing.items() if name[:4] in chosen}
+    speakers = sorted({name[:4] for name in distribution.recordings})
+    selected = choose_subjects(subjects, speakers, "the raw folder")
+    recordings = {name: file for name, file in distribution.recordings.items() if name[:4] in selected}
+    gaps = {name: text for name, text in distribution.without_parameters.items() if name[:4] in selected}
     sounds = find_sounds(raw if audio is None else audio)
     frames, shapes, problems = _survey(recordings, quiet)
     jobs = []
-    for recording in recordings:
-        name = recording.name
+    for name, file in recordings.items():
         if name not in sounds:
-            missing[name] = (
-                f"expected its sound, {name}.wav or {recording.sound}, in {raw if audio is None else audio}; --audio "
+            gaps[name] = (
+                f"expected its sound, {name}.wav or {name[:4]}/audio/…/{name[5:8]}.m4a, in {audio or raw}; --audio "
                 f"names another folder"
             )
         elif name in problems:
             jobs.append(Job(name, partial(refuse, problems[name])))
         else:
-            mean = shapes[recording.subject] if shape == "subject" else None
-            work = partial(prepare_clip, name, recording.file, sounds[name], flame, mean, dtype)
+            mean = shapes[name[:4]] if shape == "subject" else None
+            work = partial(prepare_clip, name, file, sounds[name], flame, mean, dtype)
             jobs.append(Job(name, work, frames[name]))
-    if not jobs:
-        raise nothing_to_prepare(raw, "3DMEAD", missing)
+    refuse_empty(raw, "3DMEAD", jobs, gaps)
     masks = [path for path in (find_file(raw, MASKS_FILE), flame.parent / MASKS_FILE) if path and path.is_file()][:1]
     if not masks:
-        there = {path.name for path in region_files}
-        missing |= {f"regions/{name}": MISSING_REGION for name in REGION_FILES if name not in there}
-        missing[MASKS_FILE] = MISSING_MASKS
+        names = {path.name for path in region_files}
+        gaps |= {f"regions/{name}": MISSING_REGION for name in REGION_FILES if name not in names}
+        gaps[MASKS_FILE] = MISSING_MASKS
     digest = f"a model with SHA-256 {sha256(flame)[:16]}"
     return PreparationPlan(
         corpus="mead3d",
         frame_rate=FRAME_RATE,
         unit="m",
         n_vertices=model.n_vertices,
-        options={"shape": shape, "dtype": dtype, "subjects": chosen if subjects else "all", "flame": digest},
+        options={"shape": shape, "dtype": dtype, "subjects": selected if subjects else "all", "flame": digest},
         jobs=jobs,
-        shared=partial(_write_shared, flame, recordings, shapes, masks, region_files),
-        missing=missing,
-        notes=_compare_speakers(speakers, distribution.base, missing) if subjects is None else [],
+        shared=partial(_write_shared, flame, list(recordings), shapes, masks, region_files),
+        missing=gaps,
+        notes=_compare_speakers(speakers, distribution.base, gaps) if subjects is None else [],
     )
 
 
@@ -191,61 +154,55 @@ def load_flame(path: Path) -> Flame:
     return Flame.read(path)
 
 
-def _survey(
-    recordings: Sequence[MeadRecording], quiet: bool
-) -> tuple[dict[str, int], dict[str, Array], dict[str, str]]:
+def _survey(recordings: Mapping[str, Path], quiet: bool) -> tuple[dict[str, int], dict[str, Array], dict[str, str]]:
     """Frames of every clip, every speaker's mean shape over all frames, and why clips cannot be read."""
     lengths: dict[str, int] = {}
     problems: dict[str, str] = {}
     sums: dict[str, Array] = {}
     counts: Counter[str] = Counter()
-    for recording in track(recordings, "shapes", shown=not quiet):
+    for name in track(recordings, "shapes", shown=not quiet):
         try:
-            parameters = read_parameters(recording.file)
+            parameters = read_parameters(recordings[name])
         except MissingExtraError:
             raise
         except FaceDiffError as error:
-            problems[recording.name] = str(error)
+            problems[name] = str(error)
             continue
-        frames = lengths[recording.name] = len(parameters.jaw)
-        total = sums.setdefault(recording.subject, np.zeros(SHAPES))
+        frames = lengths[name] = len(parameters.jaw)
+        total = sums.setdefault(name[:4], np.zeros(SHAPES))
         total[: len(parameters.shape)] += frames * parameters.shape
-        counts[recording.subject] += frames
+        counts[name[:4]] += frames
     return lengths, {subject: total / counts[subject] for subject, total in sums.items()}, problems
 
 
-def _compare_speakers(speakers: list[str], base: Path, missing: dict[str, str]) -> list[str]:
+def _compare_speakers(speakers: list[str], base: Path, gaps: dict[str, str]) -> list[str]:
     """Record which speakers of the data set are missing; returns a note on speakers of no published split."""
     from facediff.data.mead3d import TEST, TRAIN, VALIDATION
 
-    everyone = sorted((*TRAIN, *VALIDATION, *TEST))
-    missing.update({subject: f"no clip of this speaker in {base}" for subject in everyone if subject not in speakers})
-    others = [subject for subject in speakers if subject not in everyone]
-    return [f"{', '.join(others)}: in no published split; prepared all the same"] if others else []
+    published = sorted((*TRAIN, *VALIDATION, *TEST))
+    gaps.update({subject: f"no clip of this speaker in {base}" for subject in published if subject not in speakers})
+    foreign = [subject for subject in speakers if subject not in published]
+    return [f"{', '.join(foreign)}: in no published split; prepared all the same"] if foreign else []
 
 
 def _write_shared(
     model: Path,
-    recordings: Sequence[MeadRecording],
+    names: Collection[str],
     shapes: dict[str, Array],
     masks: Sequence[Path],
     region_files: Sequence[Path],
     out: Path,
 ) -> list[str]:
+    from facediff.data.mead3d import Mead3D
+
     flame = load_flame(model)
     templates = {subject: flame.shaped(shape) for subject, shape in shapes.items()}
     _refuse_other_templates(templates, out)
     write_templates(out / "templates.pkl", templates)
     write_mesh(out / MESH_FILE, flame.template, flame.faces)
+    clips = [clip for name in names if (clip := Mead3D.parse_name(name)) is not None]
     rows = [
-        {
-            "clip": clip.name,
-            "subject": clip.subject,
-            "sentence": f"{clip.emotion}_{clip.sequence}",
-            "emotion": clip.emotion,
-            "intensity": clip.level,
-        }
-        for clip in recordings
+        {"clip": clip.name, "subject": clip.identity, "sentence": clip.sentence, **clip.attributes} for clip in clips
     ]
     write_rows(out / "clips.csv", rows, line_end="\n")
     written = ["templates.pkl", MESH_FILE, "clips.csv"]
@@ -275,8 +232,8 @@ class RawDistribution:
     """The clips of a raw folder, those without parameters, and the folder above the speakers or ``param/``."""
 
     base: Path
-    recordings: list[MeadRecording] = field(default_factory=list)
-    missing: dict[str, str] = field(default_factory=dict)
+    recordings: dict[str, Path] = field(default_factory=dict)
+    without_parameters: dict[str, str] = field(default_factory=dict)
 
 
 def find_recordings(raw: Path) -> RawDistribution:
@@ -286,29 +243,25 @@ def find_recordings(raw: Path) -> RawDistribution:
         for folder in _folders(raw)
         if _is_probtalk3d(folder) or any((speaker / "front").is_dir() for speaker in _speakers(folder))
     ]
-    if not bases:
+    if len(bases) != 1:
         raise FaceDiffError(
-            f"{raw}: holds no reconstructions of MEAD; expected <speaker>/front/<emotion>/level_<k>/<number>/"
-            f"{RECONSTRUCTION} as EMOTE's authors distribute them, or param/<speaker>_<number>_<emotion>_<intensity>."
-            f"npy of ProbTalk3D"
-        )
-    if len(bases) > 1:
-        raise FaceDiffError(
-            f"{raw}: holds reconstructions in {bases[0]} and in {bases[1]}; give one of these folders instead"
+            f"{raw}: holds {' and '.join(map(str, bases)) or 'no'} reconstructions of MEAD; expected one folder with "
+            f"<speaker>/front/<emotion>/level_<k>/<number>/{RECONSTRUCTION} as EMOTE's authors distribute them, or "
+            f"param/<speaker>_<number>_<emotion>_<intensity>.npy of ProbTalk3D"
         )
     distribution = RawDistribution(bases[0])
     if _is_probtalk3d(distribution.base):
         files = (path for path in distribution.base.glob("param/*.npy") if CLIP.fullmatch(path.stem) and path.is_file())
-        distribution.recordings = [MeadRecording(path.stem, path) for path in files]
+        distribution.recordings = {path.stem: path for path in files}
     else:
         for speaker in _speakers(distribution.base):
             for name, folder in _numbered(speaker / "front", speaker.name):
                 file = folder / RECONSTRUCTION
                 if file.is_file():
-                    distribution.recordings.append(MeadRecording(name, file))
+                    distribution.recordings[name] = file
                 elif folder.is_dir():
-                    distribution.missing[name] = f"expected {file}"
-    distribution.recordings = sorted({recording.name: recording for recording in distribution.recordings}.values())
+                    distribution.without_parameters[name] = f"expected {file}"
+    distribution.recordings = dict(sorted(distribution.recordings.items()))
     return distribution
 
 
@@ -320,11 +273,11 @@ def find_sounds(root: Path) -> dict[str, Path]:
     """
     best: dict[str, tuple[int, Path]] = {}
     for folder in _folders(root):
-        named = [(path.stem, path) for path in sorted(folder.iterdir()) if CLIP.fullmatch(path.stem)]
+        files = [(path.stem, path) for path in sorted(folder.iterdir()) if CLIP.fullmatch(path.stem)]
         for speaker in _speakers(folder):
             for inner in (speaker / "audio", speaker):
-                named += _numbered(inner, speaker.name)
-        for name, path in named:
+                files += _numbered(inner, speaker.name)
+        for name, path in files:
             suffix = path.suffix.lower()
             if suffix in SOUND_SUFFIXES and path.is_file():
                 best[name] = min(best.get(name, (len(SOUND_SUFFIXES), path)), (SOUND_SUFFIXES.index(suffix), path))
@@ -332,9 +285,7 @@ def find_sounds(root: Path) -> dict[str, Path]:
 
 
 def _folders(root: Path, depth: int = DEPTH) -> Iterator[Path]:
-    """A folder and those in it, but neither speakers' folders nor hidden ones."""
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: no such folder; expected the data as it was distributed, unpacked")
+    """A folder and its folders, but neither speakers' folders nor hidden ones."""
     inner = folders_in(root)
     yield root
     for folder in inner if depth else ():
@@ -352,6 +303,8 @@ def _is_probtalk3d(folder: Path) -> bool:
 
 def _numbered(folder: Path, speaker: str) -> Iterator[tuple[str, Path]]:
     """The clip's name and path of everything with a number for a name in ``<emotion>/level_<k>/`` below a folder."""
+    from facediff.data.mead3d import EMOTIONS
+
     for index, emotion in enumerate(EMOTIONS):
         for level in LEVELS:
             inner = folder / emotion / f"level_{level}"

@@ -17,19 +17,19 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.corpus import as_template, load_template_dict
-from facediff.data.prepare.motion import resample_frames
-from facediff.data.prepare.runner import (
+from facediff.data.preparation import (
     Job,
     Precision,
     PreparationPlan,
     copy_files,
     find_file,
     find_regions,
-    nothing_to_prepare,
+    refuse_empty,
     write_clip,
     write_templates,
 )
-from facediff.errors import FaceDiffError
+from facediff.data.reconstructions import resample_frames
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.arrays import open_vertices
 from facediff.utils.pickles import load_pickle
 
@@ -42,6 +42,7 @@ OPTIONAL = {
     "FLAME_masks.pkl": "lips and upper face; from flame.is.tue.mpg.de (FLAME vertex masks)",
 }
 LISTS = "not needed in addition to FLAME_masks.pkl; the FaceDiffuser repository has it in data/vocaset/regions/"
+REGION_FILES = ("lve.txt", "fdd.txt")
 FULL_SCALE = 32768.0  # of 16-bit samples
 SAMPLE_RATES = (8_000, 192_000)
 
@@ -86,19 +87,19 @@ def plan(
     }
     extras = [path for name in OPTIONAL if (path := find_file(raw, name)) is not None]
     region_files = find_regions(raw, regions)
-    missing = _missing_extras([*extras, *region_files])
+    gaps = _missing_extras([*extras, *region_files])
     notes: list[str] = []
     jobs = []
     for subject in sorted({*row_map, *sounds}):
         if subject not in templates:
-            missing[f"template of {subject}"] = f"expected in {TEMPLATES}; no clip of {subject} is written without it"
+            gaps[f"template of {subject}"] = f"expected in {TEMPLATES}; no clip of {subject} is written without it"
             continue
         rows_of, sound_of = row_map.get(subject, {}), sounds.get(subject, {})
         for sentence in sorted({*SENTENCES, *rows_of, *sound_of}):
             name = f"{subject}_{sentence}"
-            lacking = [file for file, there in ((ROWS, rows_of), (AUDIO, sound_of)) if there.get(sentence) is None]
-            if lacking:
-                missing[name] = f"not in {' nor in '.join(lacking)}; the distribution lacks some"
+            files = [file for file, entries in ((ROWS, rows_of), (AUDIO, sound_of)) if entries.get(sentence) is None]
+            if files:
+                gaps[name] = f"not in {' nor in '.join(files)}; the distribution lacks some"
                 continue
             recording = VocasetRecording(
                 _rows(rows_of[sentence], name, notes), sound_of[sentence], f"{subject} {sentence}"
@@ -108,8 +109,7 @@ def plan(
             jobs.append(Job(name, work, frames))
     if len(row_map) < SUBJECTS:
         notes.append(f"{ROWS} has {len(row_map)} of the {SUBJECTS} subjects")
-    if not jobs:
-        raise nothing_to_prepare(raw, "VOCASET", missing)
+    refuse_empty(raw, "VOCASET", jobs, gaps)
     return PreparationPlan(
         corpus="vocaset",
         frame_rate=float(frame_rate),
@@ -118,7 +118,7 @@ def plan(
         options={"frame_rate": frame_rate, "decimate": decimate, "dtype": dtype},
         jobs=jobs,
         shared=partial(_write_shared, templates, extras, region_files),
-        missing=missing,
+        missing=gaps,
         notes=notes,
     )
 
@@ -140,11 +140,6 @@ def prepare_clip(
 
     samples, rate = read_samples(recording.audio, recording.where)
     frames = min(len(recording.rows), round(len(samples) / rate * RAW_RATE))
-    if not frames:
-        raise FaceDiffError(
-            f"{recording.where}: has {len(recording.rows)} frames in {ROWS} and {len(samples)} samples in {AUDIO}; "
-            f"expected at least one frame of both"
-        )
     rows = recording.rows[:frames]
     store = open_vertices(vertices)
     wrong = (rows < 0) | (rows >= len(store))
@@ -155,10 +150,6 @@ def prepare_clip(
             f"the files belong to different releases or one is truncated"
         )
     motion = np.asarray(store[rows])
-    finite = np.isfinite(motion).all(axis=(1, 2))
-    if not finite.all():
-        frame = int(np.argmin(finite))
-        raise FaceDiffError(f"{recording.where}: frame {frame}, row {rows[frame]} of {vertices}, holds NaN or infinity")
     motion = halved(motion, decimate) if frame_rate != RAW_RATE else motion
     speech = to_speech(samples, rate, recording.where)
     return write_clip(out, name, motion, speech, dtype)
@@ -176,11 +167,9 @@ def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], fl
 
     Whole numbers of any type, and floats beyond -1 … 1, are 16-bit samples.
     """
-    try:
+    with damaged(f"{where}: its sound in {AUDIO}", "expected an array of numbers with a rate"):
         rate, samples = float(entry["sample_rate"]), np.squeeze(np.asarray(entry["audio"]))  # type: ignore[index]
         peak = float(np.abs(samples.astype(np.float64)).max())
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise FaceDiffError(f"{where}: its sound in {AUDIO} is no array of numbers with a rate ({error})") from error
     channels = min(samples.shape) if samples.ndim == 2 else 1
     signed = samples.ndim in (1, 2) and channels <= 2 and samples.dtype.kind in "if" and peak <= FULL_SCALE
     if not signed or not SAMPLE_RATES[0] <= rate <= SAMPLE_RATES[1]:
@@ -207,30 +196,28 @@ def _need(raw: Path, name: str) -> Path:
 def _nested(path: Path) -> dict[str, dict[str, Any]]:
     """A pickle with a dict from subject to a dict by sentence."""
     loaded = load_pickle(path)
-    if not isinstance(loaded, dict) or not all(isinstance(inner, dict) for inner in loaded.values()):
-        raise FaceDiffError(f"{path}: expected a dict from subject to a dict by sentence; get the file again")
-    return {str(subject): {str(key): value for key, value in inner.items()} for subject, inner in loaded.items()}
+    with damaged(path, "expected a dict from subject to a dict by sentence; get the file again"):
+        return {str(subject): {str(key): value for key, value in inner.items()} for subject, inner in loaded.items()}
 
 
 def _rows(frames: object, name: str, notes: list[str]) -> npt.NDArray[np.int64]:
     """Rows of a clip in the order of its frames."""
-    try:
+    with damaged(f"{ROWS}: {name}", "expected a dict from frame to row"):
         # An index that has been a float would be rounded silently.
         pairs = sorted((index(frame), index(row)) for frame, row in dict(frames).items())  # type: ignore[call-overload]
-    except (TypeError, ValueError) as error:
-        raise FaceDiffError(f"{ROWS}: {name}: expected a dict from frame to row ({error})") from error
     if pairs and pairs[-1][0] != len(pairs) - 1:
         notes.append(f"{name}: {ROWS} leaves out some of the frames up to {pairs[-1][0]}; it is written without them")
     return np.array([row for _, row in pairs], np.int64)
 
 
 def _missing_extras(files: Sequence[Path]) -> dict[str, str]:
-    there = {path.name for path in files}
-    missing = {name: f"no such file in the raw folder: {text}" for name, text in OPTIONAL.items() if name not in there}
-    if "FLAME_masks.pkl" not in there:
-        lists = (name for name in ("lve.txt", "fdd.txt") if name not in there)
-        missing |= {f"regions/{name}": f"no such file in the raw folder: {LISTS}" for name in lists}
-    return missing
+    names = {path.name for path in files}
+    advice = {**OPTIONAL, **({} if "FLAME_masks.pkl" in names else {f"regions/{name}": LISTS for name in REGION_FILES})}
+    return {
+        name: f"no such file in the raw folder: {text}"
+        for name, text in advice.items()
+        if name.removeprefix("regions/") not in names
+    }
 
 
 def _write_shared(

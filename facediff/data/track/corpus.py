@@ -20,7 +20,7 @@ from facediff.data.corpus import read_clip_table, read_manifest, read_templates
 from facediff.data.manifest import FORMAT
 from facediff.data.person.fitting import loudness, neutral_frames
 from facediff.data.person.importer import NAME, cut_points, splits
-from facediff.data.prepare.runner import MANIFEST, version, write_clip, write_mesh, write_templates
+from facediff.data.preparation import MANIFEST, version, write_clip, write_mesh, write_templates
 from facediff.data.track.face import (
     MILLIMETRES,
     filled,
@@ -85,7 +85,7 @@ class PersonReport:
 
 @dataclass(frozen=True)
 class TrackingReport:
-    """What was written, and the videos that could not be used, with the reasons."""
+    """The clips that were written, and the videos that could not be used, with the reasons."""
 
     out: Path
     people: tuple[PersonReport, ...]
@@ -198,7 +198,7 @@ def import_video(video: Path, name: str, corpus: Path, out: Path, clip_seconds: 
 def tracking_tasks(
     videos: Mapping[str, Sequence[Path]], tracks: Path, model: FaceModel, options: TrackingOptions
 ) -> dict[str, list[FileTask]]:
-    """A task for each video, whose output is in a hidden folder."""
+    """A task for each video, with its output in a hidden folder."""
     recipe = Recipe(("track", str(options.face), str(options.min_face)), {"model": model.digest})
     return {
         name: [FileTask(path, tracks / name / f"{path.name}.npz", recipe) for path in files]
@@ -212,7 +212,7 @@ def _record(task: FileTask, problem: str, written: object) -> None:
 
 @dataclass(frozen=True, eq=False)
 class WrittenClip:
-    """A clip that was written: its row of ``clips.csv``, and what a neutral face and warnings are found by, (T,)."""
+    """A clip on disk: its row of ``clips.csv``, and series (T,) by which a neutral face and warnings are found."""
 
     row: dict[str, Any]
     gaps: Array  # between the lips, in metres
@@ -245,7 +245,7 @@ class PeopleWriter:
 
         Args:
             name: the person's name.
-            tasks: whose outputs are the person's tracks.
+            tasks: the outputs are the person's tracks.
             failed: reasons by video; what cannot be used is added.
         """
         recordings: list[tuple[Recording, RecordingSummary]] = []
@@ -397,7 +397,7 @@ class PeopleWriter:
 
 
 def difference_ratio(motion: Array) -> float:
-    """Root mean square of second differences over that of first ones: 1.7 for noise, less for motion."""
+    """Root mean square of second differences as a share of the first ones': 1.7 for noise, less for motion."""
     first = np.diff(motion, axis=0)
     scale = np.sqrt(np.nanmean(np.square(first)))
     return float(np.sqrt(np.nanmean(np.square(np.diff(first, axis=0)))) / max(scale, 1e-12))
@@ -406,7 +406,7 @@ def difference_ratio(motion: Array) -> float:
 def warnings(
     recordings: Sequence[tuple[Recording, RecordingSummary]], clips: Sequence[WrittenClip], rate: float
 ) -> Iterator[str]:
-    """What a user should know of a person's videos."""
+    """Warnings about a person's videos."""
     for recording, summary in recordings:
         name = recording.source.name
         if summary.face_pixels < SMALL_FACE:

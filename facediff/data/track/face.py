@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.motion import resample_frames
+from facediff.data.reconstructions import resample_frames
 from facediff.data.track.model import POINTS, FaceModel
 from facediff.data.track.topology import EYE_CORNERS, IRIS, LIP_PAIRS, sharpness, without_webs
 from facediff.mesh.alignment import fit_similarities
@@ -80,7 +80,7 @@ def median_face(landmarks: npt.NDArray[np.floating], model: FaceModel) -> Array:
 
 
 def filled(values: Array, times: Array) -> Array:
-    """Values (T, ...) in which what is NaN is interpolated between its neighbours."""
+    """Values (T, ...) in which NaN is replaced by interpolation between its neighbours."""
     rows = values.reshape(len(values), -1)
     missing = ~np.isfinite(rows).all(axis=1)
     if not missing.any():

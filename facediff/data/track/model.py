@@ -30,7 +30,7 @@ MEMBERS = ("face_detector.tflite", "face_landmarks_detector.tflite", "geometry_p
 
 @dataclass(frozen=True)
 class FaceModel:
-    """What the file holds.
+    """The content of the file.
 
     Attributes:
         detector: graph of the face detector: image (1, 128, 128, 3) in −1 … 1; boxes (1, 896, 16), logits (1, 896, 1).

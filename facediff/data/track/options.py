@@ -26,12 +26,12 @@ class TrackingOptions:
     """Tracking faces in videos.
 
     Attributes:
-        model: Google's face_landmarker.task (default: that of the environment variable FACEDIFF_FACE_MODEL)
+        model: Google's face_landmarker.task (default: named by the environment variable FACEDIFF_FACE_MODEL)
         frame_rate: frames a second of the corpus
         face: which of several faces: largest, left, or its number from the left
         min_face: width in pixels of the smallest face
         smoothing: of the motion, by region; or none
-        scale: size of the faces: that of the model's canonical face, or so that irises measure 11.7 mm
+        scale: size of the faces: as the model's canonical face, or so that irises measure 11.7 mm
         clip_seconds: approximate length of a clip
         licence: terms of the footage, such as CC-BY-4.0 or "consent of Maria"
         commercial: the terms allow commercial use

@@ -156,7 +156,7 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class RecordingSummary:
-    """What the frames of a recording say as a whole.
+    """Measures of all frames of a recording.
 
     Attributes:
         parts: first frame, and frame after the last, of the parts without cuts and long gaps.

@@ -1,7 +1,7 @@
 """A convolutional network of TensorFlow Lite as a graph of ONNX, in memory: the operations of Google's face landmarker.
 
-A ``.tflite`` file is a flatbuffer (google.github.io/flatbuffers): tables with numbered fields. The numbers of fields
-and operations are those of ``tensorflow/lite/schema/schema.fbs``.
+A ``.tflite`` file is a flatbuffer (google.github.io/flatbuffers): tables with numbered fields. Fields
+and operations have the numbers of ``tensorflow/lite/schema/schema.fbs``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The face of 468 vertices: regions, pairs of vertices, and the triangles that leave eyes and mouth open.
 
-Numbers are those of MediaPipe's canonical face, in its ``geometry_pipeline_metadata_landmarks.binarypb``.
+Vertices are numbered as in MediaPipe's canonical face, in its ``geometry_pipeline_metadata_landmarks.binarypb``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Landmarks of a face in the pictures of a video, as Google's face landmarker finds them.
 
-The face is detected in the first picture, and again where it was lost; between, the landmarks of a picture say where to
-look for those of the next.
+The face is detected in the first picture, and again where it was lost; between, the landmarks of a picture give the
+region in which the next picture's are sought.
 """
 
 from __future__ import annotations

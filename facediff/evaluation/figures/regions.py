@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.check.layouts import MANIFEST, CorpusView, identify, list_folder, read_record
+from facediff.data.check.layouts import MANIFEST, CorpusView, identify, list_folder, manifest_in
 from facediff.data.check.report import Findings
 from facediff.data.corpus import MOTION_FOLDERS, Corpus, find_region
 from facediff.errors import FaceDiffError
@@ -66,7 +66,7 @@ def draw_regions(
 def find_view(root: Path, corpus: str | None) -> CorpusView:
     """What a folder is, as ``facediff data check`` recognises it."""
     findings = Findings()
-    manifest = read_record(root, MANIFEST, findings)
+    manifest = manifest_in(root, MANIFEST, findings)
     view = identify(list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, manifest, findings)
     if view is None:
         raise FaceDiffError(f"{root}: {findings[-1].message}")

@@ -240,11 +240,9 @@ def datasets() -> dict[str, Dataset]:
     from facediff.data.biwi import Biwi
     from facediff.data.vocaset import Vocaset
 
-    return {
-        "vocaset": Dataset(5023, 30.0, tuple(Vocaset.identities), "m"),
-        "biwi": Dataset(23370, 25.0, tuple(Biwi.identities), Biwi.unit),
-        "multiface": Dataset(6172, 30.0, ("2", "3", "6", "7", "9", "10", "11", "12", "13"), "0.122"),
-    }
+    known = {m.corpus_name: Dataset(m.n_vertices, m.frame_rate, tuple(m.identities), m.unit) for m in (Vocaset, Biwi)}
+    identities = ("2", "3", "6", "7", "9", "10", "11", "12", "13")
+    return {**known, "multiface": Dataset(6172, 30.0, identities, "0.122")}
 
 
 def facts_of(files: AuthorFiles, options: ImportOptions, asked: Mapping[str, Any]) -> Facts:

@@ -1,6 +1,6 @@
 """Hair: one shell of strands from the hairline to the crown, which every style shapes in its own way. Lengths in mm.
 
-The columns of its grid run round the head as those of the skin do, its rows from the hairline upwards. A style says how
+The columns of its grid run round the head as in the skin, its rows from the hairline upwards. A style says how
 thick the shell is, and where it falls below the hairline and how far.
 """
 
@@ -24,7 +24,7 @@ class _Cut:
     Attributes:
         top: thickness on the top of the head.
         sides: thickness at the sides and the back.
-        quiff: what the hair over the forehead stands off more.
+        quiff: additional distance of the hair over the forehead.
         falls: angles round the head between which the hair begins to fall below the hairline.
         end: height at which falling hair ends.
         over_ears: how far it stands off there.

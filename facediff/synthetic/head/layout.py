@@ -1,7 +1,7 @@
 """How the skin is cut into quads: one grid over the left half, with holes for mouth, eye, nostril and ear.
 
 The grid runs from the middle of the face to the back of the head, and from the neck to the crown. At a hole it is cut
-open along a rectangle of cells, whose border is moved onto a curve round the feature; loops of quads from that border
+open along a rectangle of cells, and its border is moved onto a curve round the feature; loops of quads from that border
 inwards make the feature (:mod:`facediff.synthetic.head.parts`). So every loop round mouth and eyes is closed, as a
 modeller would lay it, and vertices with more or fewer than four edges lie at the corners of the rectangles only.
 """
@@ -110,7 +110,7 @@ def eye_ring(distance: float) -> Array:
 @lru_cache(maxsize=1)
 def lay_out() -> Layout:
     """Place and connect the vertices of the left half of the skin."""
-    held = _held()
+    fixed = _held()
     quads = np.array(
         [
             (_at(column, row), _at(column + 1, row), _at(column + 1, row + 1), _at(column, row + 1))
@@ -119,14 +119,14 @@ def lay_out() -> Layout:
             if not any(c0 <= column < c1 and r0 <= row < r1 for c0, c1, r0, r1 in _HOLES.values())
         ]
     )
-    plane = _relaxed(quads, held)
-    used = np.unique(quads)
+    plane = _relaxed(quads, fixed)
+    indices = np.unique(quads)
     number = np.full((COLUMNS + 1) * (ROWS + 1), -1)
-    number[used] = np.arange(len(used))
+    number[indices] = np.arange(len(indices))
     holes = {name: number[_border(name)] for name in _HOLES}
     top = number[[_at(column, ROWS) for column in range(COLUMNS + 1)]]
     shirt = number[: SHIRT_ROWS * (COLUMNS + 1)]
-    return Layout(plane[used], number[quads], holes, top, shirt)
+    return Layout(plane[indices], number[quads], holes, top, shirt)
 
 
 def _at(column: int, row: int) -> int:
@@ -147,7 +147,7 @@ def _border(name: str) -> list[int]:
 
 
 def _held() -> dict[int, tuple[float, float]]:
-    """Vertices whose place in the plane is given: the grid's edges, the borders of holes, and the nose."""
+    """Vertices with a given place in the plane: the grid's edges, the borders of holes, and the nose."""
     heights = dict(enumerate(_BELOW))
     border = mouth_ring(MOUTH_MARGIN)
     heights[17], heights[21] = border[-1, 1], border[0, 1]
@@ -155,31 +155,31 @@ def _held() -> dict[int, tuple[float, float]]:
     heights |= dict(zip(range(33, 41), np.linspace(27, 60, 8), strict=True))
     heights |= dict(zip(range(41, ROWS + 1), np.linspace(67.0, 132.0, ROWS - 40), strict=True))
     end = TOP - 1.0  # the crown itself is one vertex, which no grid reaches
-    held = {_at(0, row): (0.0, float(level_of(height))) for row, height in heights.items()}
+    fixed = {_at(0, row): (0.0, float(level_of(height))) for row, height in heights.items()}
     first = float(level_of(heights[SHIRT_ROWS + 1]))
     back = np.linspace(first, end, ROWS - SHIRT_ROWS)
-    held |= {_at(COLUMNS, row): (np.pi, level) for row, level in enumerate(back.tolist(), start=SHIRT_ROWS + 1)}
+    fixed |= {_at(COLUMNS, row): (np.pi, level) for row, level in enumerate(back.tolist(), start=SHIRT_ROWS + 1)}
     # Cells are narrow in the face and wide at the back.
     angles = np.pi * np.interp(np.arange(COLUMNS + 1), [0, 12, 17, 20, 26], [0, 0.30, 0.46, 0.58, 1.0])
     for column, angle in enumerate(angles):
-        held[_at(column, ROWS)] = angle, end
-        held |= {_at(column, row): (angle, float(level_of(heights[row]))) for row in range(SHIRT_ROWS + 2)}
+        fixed[_at(column, ROWS)] = angle, end
+        fixed |= {_at(column, row): (angle, float(level_of(heights[row]))) for row in range(SHIRT_ROWS + 2)}
     for name, outline in (("mouth", border), ("eye", eye_ring(EYE_MARGIN))):
-        held |= dict(zip(_border(name), map(tuple, plane_of(outline).tolist()), strict=True))
+        fixed |= dict(zip(_border(name), map(tuple, plane_of(outline).tolist()), strict=True))
     for row, columns in _NOSE_COLUMNS.items():
         # The lowest rows rise towards the cheek, as the base of the nose does.
         lift = np.interp(np.arange(1, len(columns) + 1), [3, 4, 5], [0.0, 0.6, 1.5]) * (row <= 25)
-        places = plane_of(np.stack([np.array(columns), heights[row] + lift], axis=1))
-        for column, place in enumerate(places.tolist(), start=1):
-            held.setdefault(_at(column, row), (place[0], place[1]))
+        positions = plane_of(np.stack([np.array(columns), heights[row] + lift], axis=1))
+        for column, position in enumerate(positions.tolist(), start=1):
+            fixed.setdefault(_at(column, row), (position[0], position[1]))
     turn = 2.0 * np.pi * np.arange(len(_border("ear"))) / len(_border("ear"))
     level = float(level_of(_EAR_HEIGHT))
     for vertex, angle in zip(_border("ear"), turn, strict=True):
-        held[vertex] = (_EAR_CENTRE - _EAR_SIZE[0] * np.cos(angle), level + _EAR_SIZE[1] * np.sin(angle))
-    return held
+        fixed[vertex] = (_EAR_CENTRE - _EAR_SIZE[0] * np.cos(angle), level + _EAR_SIZE[1] * np.sin(angle))
+    return fixed
 
 
-def _relaxed(quads: Index, held: dict[int, tuple[float, float]]) -> Array:
+def _relaxed(quads: Index, fixed: dict[int, tuple[float, float]]) -> Array:
     """Put every other vertex into the middle of its neighbours (Tutte's embedding, which cannot fold)."""
     count = (COLUMNS + 1) * (ROWS + 1)
     joined = np.zeros((count, count), dtype=bool)
@@ -187,12 +187,12 @@ def _relaxed(quads: Index, held: dict[int, tuple[float, float]]) -> Array:
         joined[start, end] = joined[end, start] = True
     system = np.diag(joined.sum(axis=1).astype(np.float64)) - joined
     right = np.zeros((count, 2))
-    alone = ~joined.any(axis=1)
-    for vertex in (*held, *np.flatnonzero(alone).tolist()):
+    isolated = ~joined.any(axis=1)
+    for vertex in (*fixed, *np.flatnonzero(isolated).tolist()):
         system[vertex] = 0.0
         system[vertex, vertex] = 1.0
-        angle, level = held.get(vertex, (0.0, 0.0))
+        angle, level = fixed.get(vertex, (0.0, 0.0))
         right[vertex] = _PLANE_RADIUS * angle, level
-    places = np.linalg.solve(system, right)
-    places[:, 0] = np.clip(places[:, 0] / _PLANE_RADIUS, 0.0, np.pi)
-    return places
+    positions = np.linalg.solve(system, right)
+    positions[:, 0] = np.clip(positions[:, 0] / _PLANE_RADIUS, 0.0, np.pi)
+    return positions

@@ -40,7 +40,7 @@ class Mask:
     faces: Index
     vertex_of: Index
 
-    def carry(self, values: Array) -> Array:
+    def transfer(self, values: Array) -> Array:
         """Values (V, …) of the head's vertices at the mask's, (M, …)."""
         return np.asarray(self.operator @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
 
@@ -53,32 +53,32 @@ class Mask:
 
 @lru_cache(maxsize=1)
 def build_mask() -> Mask:
-    """The mask of the average head, which has the topology of everybody's."""
+    """The mask of the average head; all masks have its topology."""
     from scipy.sparse import csr_array
 
     head = build_head()
-    kept = np.zeros(len(head.vertices), dtype=bool)
-    kept[head.both(*_SKIN)] = True
-    kept[head.both("skin_shirt")] = False
-    kept &= (head.vertices[:, 2] > _FRONT) & (head.vertices[:, 1] > _LOWEST)
-    whole = np.array([len(set(quad)) == 4 for quad in head.quads.tolist()])
-    quads = head.quads[kept[head.quads].all(axis=1) & whole]
-    chosen, flat = np.unique(quads, return_inverse=True)
+    inside = np.zeros(len(head.vertices), dtype=bool)
+    inside[head.both(*_SKIN)] = True
+    inside[head.both("skin_shirt")] = False
+    inside &= (head.vertices[:, 2] > _FRONT) & (head.vertices[:, 1] > _LOWEST)
+    proper = np.array([len(set(quad)) == 4 for quad in head.quads.tolist()])
+    quads = head.quads[inside[head.quads].all(axis=1) & proper]
+    vertices, flat = np.unique(quads, return_inverse=True)
     quads = flat.reshape(quads.shape)
-    ones = np.ones(len(chosen))
-    operator = csr_array((ones, (np.arange(len(chosen)), chosen)), shape=(len(chosen), len(head.vertices)))
+    ones = np.ones(len(vertices))
+    operator = csr_array((ones, (np.arange(len(vertices)), vertices)), shape=(len(vertices), len(head.vertices)))
     for _ in range(_LEVELS):
         step, quads = _subdivided(quads, operator.shape[0])
         operator = step @ operator
     vertex_of = np.full(len(head.vertices), -1)
-    vertex_of[chosen] = np.arange(len(chosen))
+    vertex_of[vertices] = np.arange(len(vertices))
     return Mask(csr_array(operator), np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), vertex_of)
 
 
 def _subdivided(quads: Index, count: int) -> tuple[csr_array, Index]:
     """Factors of one step of the rule on a mesh of ``count`` vertices, and its quads.
 
-    The old vertices keep their numbers; those of edges and faces follow.
+    The old vertices keep their numbers; vertices of edges and faces follow.
     """
     from scipy.sparse import coo_array, csr_array, diags_array, vstack
 
@@ -105,10 +105,10 @@ def _subdivided(quads: Index, count: int) -> tuple[csr_array, Index]:
     outer = np.repeat(~inner, 2)
     border_at = factors(ends[outer], at_edges[outer], np.ones(int(outer.sum())), (count, len(edges)))
     n = np.maximum(valence, 1.0)
-    own = diags_array(np.where(border, 0.5, (n - 3.0) / n))
+    vertex_part = diags_array(np.where(border, 0.5, (n - 3.0) / n))
     mean_face = diags_array(np.where(border, 0.0, 1.0 / n**2)) @ (faces_at @ face)
     mean_edge = diags_array(np.where(border, 0.0, 2.0 / n**2)) @ (edges_at @ middle)
-    vertex = own + mean_face + mean_edge + diags_array(np.where(border, 0.25, 0.0)) @ (border_at @ middle)
+    vertex = vertex_part + mean_face + mean_edge + diags_array(np.where(border, 0.25, 0.0)) @ (border_at @ middle)
     centre = count + len(edges) + np.arange(number)
     corners = [
         np.stack([quads[:, i], count + edge_of[:, i], centre, count + edge_of[:, i - 1]], axis=1) for i in range(4)

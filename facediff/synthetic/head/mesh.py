@@ -38,7 +38,7 @@ class QuadMesh:
         return triangles[(first != second) & (second != third) & (third != first)]
 
     def both(self, *prefixes: str) -> Index:
-        """Sorted vertices on both sides of all groups whose names start with one of these."""
+        """Sorted vertices on both sides of all groups with names that start with one of these."""
         left = [index for name, index in self.groups.items() if name.startswith(prefixes)]
         return np.unique(np.concatenate([*left, *(self.mirror[index] for index in left)]))
 
@@ -55,12 +55,12 @@ class HalfQuadMesh:
 
     def add(self, name: str, points: ArrayLike, colour: ArrayLike) -> Index:
         """Add points (n, 3) under a name, in one colour (3,) or a colour each (n, 3); returns their numbers."""
-        places = np.array(points, dtype=np.float64)
-        index = np.arange(self.count, self.count + len(places))
-        self.points.append(places)
-        self.colours.append(np.array(np.broadcast_to(np.asarray(colour, dtype=np.float64), places.shape)))
+        positions = np.array(points, dtype=np.float64)
+        index = np.arange(self.count, self.count + len(positions))
+        self.points.append(positions)
+        self.colours.append(np.array(np.broadcast_to(np.asarray(colour, dtype=np.float64), positions.shape)))
         self.groups[name] = index
-        self.count += len(places)
+        self.count += len(positions)
         return index
 
     def at(self, name: str) -> Array:
@@ -83,8 +83,8 @@ class HalfQuadMesh:
     def lid(self, loop: Index) -> None:
         """Close a loop with a row of quads from its one side to the other."""
         half = (len(loop) + 1) // 2
-        near, far = loop[:half], loop[::-1][:half]
-        self.quads.append(np.stack([near[:-1], far[:-1], far[1:], near[1:]], axis=1))
+        near, opposite = loop[:half], loop[::-1][:half]
+        self.quads.append(np.stack([near[:-1], opposite[:-1], opposite[1:], near[1:]], axis=1))
 
     def mirrored(self) -> QuadMesh:
         """Both halves: the left half's vertices, then the mirror images of all that are off the midline."""

@@ -101,7 +101,7 @@ def _add_mouth(half: HalfQuadMesh, layout: Layout) -> None:
     full = np.sqrt(np.clip(1.0 - (x / MOUTH_HALF_WIDTH) ** 2, 0.0, 1.0))  # 0 at the corner, where both become one
     depth = seam_depth(border)
     # Share of the way from the line of contact to the border, lift off that line, how far forward upper and lower lip
-    # stand, and width. The lips bulge in the middle and not at the corner, so what is positive follows their fullness.
+    # stand, and width. The lips bulge in the middle and not at the corner, so positive values follow their fullness.
     for name, share, lift, upper, lower, width, colour in (
         ("lip_outer", 0.72, 0.0, 2.2, 2.6, 0.996, LIP),
         ("lip_crest", 0.42, 0.0, 3.6, 4.4, 0.986, LIP),
@@ -121,7 +121,7 @@ def _add_mouth(half: HalfQuadMesh, layout: Layout) -> None:
 
 
 def seam_depth(border: Array) -> Array:
-    """Depth (21,) of the surface on which the lips meet: in the middle that of their outlines, behind at the corner."""
+    """Depth (21,) of the surface on which the lips meet: in the middle as their outlines, behind at the corner."""
     upper = border[: MOUTH_POINTS // 2 + 1]
     depths = np.interp([0, 8, 16, 22, 25], upper[:, 0], upper[:, 2]) - [0.0, 0.0, 0.3, 0.8, 1.0]
     depths[0] = 0.5 * (border[0, 2] + border[-1, 2])
@@ -157,7 +157,7 @@ def _add_eye(half: HalfQuadMesh, layout: Layout) -> None:
     beside = ((points - EYE_CENTRE)[:, :2] ** 2).sum(axis=1)
     points[:, 2] = EYE_CENTRE[2] + np.sqrt(np.clip((EYE_RADIUS + 0.3) ** 2 - beside, 1.0, None)) - 0.3
     loops.append(half.add("lid_behind", points, _BEHIND_LIDS))
-    # They end on the ball, so that nobody looks past it into the head; at the inner corner that makes the caruncle.
+    # They end on the ball, so that no view passes it into the head; at the inner corner that makes the caruncle.
     away = points - EYE_CENTRE + np.array([0.0, 0.0, -2.5])
     away *= (EYE_RADIUS - 0.3) / np.linalg.norm(away, axis=1, keepdims=True)
     loops.append(half.add("lid_end", EYE_CENTRE + away, _BEHIND_LIDS))
@@ -188,13 +188,13 @@ def lash_places() -> Array:
 def _add_lashes(half: HalfQuadMesh, edge: Array) -> None:
     """Lashes of the upper lid, a long triangle each: two vertices at the root, one at the tip."""
     upper, along = edge[: EYE_POINTS // 2 + 1], np.linspace(0.0, 1.0, EYE_POINTS // 2 + 1)
-    for number, place in enumerate(lash_places()):
+    for number, position in enumerate(lash_places()):
         roots = [
             np.array([np.interp(min(at, 1.0), along, upper[:, axis]) for axis in range(3)])
-            for at in (place, place + 0.022)
+            for at in (position, position + 0.022)
         ]
         out = (roots[0] - EYE_CENTRE) / np.linalg.norm(roots[0] - EYE_CENTRE)
-        tip = roots[0] + (2.4 + 2.0 * place) * (0.85 * out + np.array([0.75 * (place - 0.4), 0.35, 0.35]))
+        tip = roots[0] + (2.4 + 2.0 * position) * (0.85 * out + np.array([0.75 * (position - 0.4), 0.35, 0.35]))
         index = half.add(f"lash_{number:02d}", [*(root + np.array([0.0, 0.0, 0.05]) for root in roots), tip], _LASH)
         half.quads.append(index[[0, 1, 2, 2]][None])
 
@@ -329,14 +329,14 @@ def _add_tongue(half: HalfQuadMesh) -> None:
     front = float(seam_depth(half.at("lip_border"))[0]) - 13.0
     turn = np.linspace(0.0, np.pi, 8)  # from the middle of the back round the edge to the middle underneath
     loops = []
-    for number, place in enumerate(np.linspace(0.0, 1.0, 9)):
-        width = 15.5 * np.sqrt(np.clip(1.0 - (1.0 - min(place / 0.45, 1.0)) ** 2, 0.04, 1.0))
-        thickness = 2.2 + 4.5 * np.sin(0.8 * np.pi * min(0.15 + place, 1.0))
-        height = -53.1 + 6.0 * np.sin(np.pi * (0.15 + 0.7 * place))
+    for number, position in enumerate(np.linspace(0.0, 1.0, 9)):
+        width = 15.5 * np.sqrt(np.clip(1.0 - (1.0 - min(position / 0.45, 1.0)) ** 2, 0.04, 1.0))
+        thickness = 2.2 + 4.5 * np.sin(0.8 * np.pi * min(0.15 + position, 1.0))
+        height = -53.1 + 6.0 * np.sin(np.pi * (0.15 + 0.7 * position))
         x, on_top = width * np.sin(turn), np.cos(turn) > 0
         y = height + thickness * np.cos(turn) * np.where(on_top, 0.55, 1.0)
         y -= 1.2 * np.exp(-((x / 3.0) ** 2)) * on_top
-        points = np.stack([x, y, np.full_like(x, front - 42.0 * place)], axis=1)
+        points = np.stack([x, y, np.full_like(x, front - 42.0 * position)], axis=1)
         points[[0, -1], 0] = 0.0
         loops.append(half.add(f"tongue_{number}", points, _TONGUE))
     half.strips(loops)

@@ -59,7 +59,7 @@ class Complexion:
 
 @dataclass(frozen=True)
 class Face:
-    """How a head differs from the average one: what people of a group have in common, and what is left to each.
+    """The differences of a head from the average one, by groups of people and of the person alone.
 
     Every number is about -1 to 1, and 0 changes nothing.
     """
@@ -102,12 +102,12 @@ class Face:
 
     def details(self) -> dict[str, float]:
         """The numbers after the first three, with what these add to them."""
-        own = {item.name: float(getattr(self, item.name)) for item in fields(self)}
-        groups = {name: own.pop(name) for name in _GROUPS}
+        details = {item.name: float(getattr(self, item.name)) for item in fields(self)}
+        groups = {name: details.pop(name) for name in _GROUPS}
         for group, shares in _GROUPS.items():
             for name, share in shares.items():
-                own[name] += groups[group] * share
-        return own
+                details[name] += groups[group] * share
+        return details
 
 
 # Directions of the differences after Farkas' tables (1994) for sex and after Farkas and others (J. Craniofac. Surg. 15,
@@ -185,10 +185,10 @@ def dressed(face: Face, mesh: QuadMesh, complexion: Complexion) -> Array:
     """A person's head at rest (V, 3) with the hair as it is worn."""
     points = mesh.vertices.copy()
     shell, crown = hair_points(complexion.style)
-    for name, places in (("hair", shell), ("hair_crown", crown[None])):
+    for name, positions in (("hair", shell), ("hair_crown", crown[None])):
         index = mesh.groups[name]
-        points[index] = places
-        points[mesh.mirror[index]] = places * [-1.0, 1.0, 1.0]
+        points[index] = positions
+        points[mesh.mirror[index]] = positions * [-1.0, 1.0, 1.0]
     middle = mesh.mirror == np.arange(len(points))
     points[middle, 0] = 0.0
     return face(points)
@@ -214,8 +214,8 @@ def coloured(mesh: QuadMesh, complexion: Complexion) -> NDArray[np.uint8]:
     colours[grid] = colours[mesh.mirror[grid]] = strand
     colours[mesh.both("hair_crown")] *= hair_tint
     brow = np.array(HAIR) * (0.25 + 0.6 * np.minimum(hair_tint, 2.2))
-    for name, most in (("brow_0", 0.35), ("brow_1", 0.95), ("brow_2", 0.9), ("brow_3", 0.3)):
-        dense = most * np.interp(np.arange(BROW_COLUMNS), [0, 2, BROW_COLUMNS - 1], [0.35, 1.0, 0.8])[:, None]
+    for name, peak in (("brow_0", 0.35), ("brow_1", 0.95), ("brow_2", 0.9), ("brow_3", 0.3)):
+        dense = peak * np.interp(np.arange(BROW_COLUMNS), [0, 2, BROW_COLUMNS - 1], [0.35, 1.0, 0.8])[:, None]
         index = mesh.groups[name]
         colours[index] = colours[mesh.mirror[index]] = dense * brow + (1.0 - dense) * 0.93 * tone
     shirt = mesh.both("skin_shirt")

@@ -1,4 +1,4 @@
-"""What moves the head: ARKit's 52 shapes by name, two of the tongue, and a neck that turns the whole.
+"""The rig of the head: ARKit's 52 shapes by name, two of the tongue, and a neck that turns it.
 
 Every shape is a table of displacements, so that a pose is the neutral head plus a weighted sum of them, and weights and
 vertices are two ways to write one motion. Lengths are in mm.
@@ -79,15 +79,15 @@ class _Fields:
 
     def shapes(self) -> dict[str, Array]:
         """All shapes by name."""
-        both = {**self._lids(), **self._mouth_sides(), **self._upper_face()}
-        whole = {**self._jaw(), **self._mouth(), **self._tongue()}
-        whole["mouthClose"] = self._closing(whole["jawOpen"])
-        whole["browInnerUp"], whole["cheekPuff"] = both.pop("browInnerUp"), both.pop("cheekPuff")
+        symmetric = {**self._lids(), **self._mouth_sides(), **self._upper_face()}
+        shapes = {**self._jaw(), **self._mouth(), **self._tongue()}
+        shapes["mouthClose"] = self._closing(shapes["jawOpen"])
+        shapes["browInnerUp"], shapes["cheekPuff"] = symmetric.pop("browInnerUp"), symmetric.pop("cheekPuff")
         # A side's share goes from 0 to 1 across the middle, so that two equal weights give the symmetric shape.
         left = rise(self.mesh.vertices[:, 0], -10.0, 10.0)[:, None]
-        for name, field in both.items():
-            whole[f"{name}Left"], whole[f"{name}Right"] = left * field, (1.0 - left) * field
-        return {name: whole[name] for name in SHAPES}
+        for name, field in symmetric.items():
+            shapes[f"{name}Left"], shapes[f"{name}Right"] = left * field, (1.0 - left) * field
+        return {name: shapes[name] for name in SHAPES}
 
     def _move(self, dx: Array | float = 0.0, dy: Array | float = 0.0, dz: Array | float = 0.0) -> Array:
         """Displacements; ``dx`` points away from the midline on both sides."""
@@ -108,10 +108,10 @@ class _Fields:
         soft = 1.5 + 20.0 * rise(self.x, 6.0, 44.0)
         lower = rise(-self.off_line, -soft, soft)
         # Both lips share the corner's way, so that an open mouth is round and has no edge there.
-        place = np.arange(MOUTH_POINTS)
-        corner = 0.4 * (np.minimum(place, MOUTH_POINTS - 1 - place) / (MOUTH_POINTS // 2)) ** 3.2
+        position = np.arange(MOUTH_POINTS)
+        corner = 0.4 * (np.minimum(position, MOUTH_POINTS - 1 - position) / (MOUTH_POINTS // 2)) ** 3.2
         half = MOUTH_POINTS // 2
-        chain = np.where(place < half, corner, np.where(place > half, 1.0 - corner, 0.46))
+        chain = np.where(position < half, corner, np.where(position > half, 1.0 - corner, 0.46))
         for name in (*AROUND_MOUTH, *LIP_LOOPS):
             share = {"mouth_far": 0.35, "mouth_near": 0.7}.get(name, 1.0)
             self._loop(lower, name, (1.0 - share) * lower[self.mesh.groups[name]] + share * chain)
@@ -254,11 +254,13 @@ class _Fields:
             away = edge + closing + side * taper * beyond * np.array([0.0, 1.0, 0.0]) - EYE_CENTRE
             on_ball = EYE_CENTRE + away * (EYE_RADIUS + 0.4) / np.linalg.norm(away, axis=1, keepdims=True)
             self._loop(blink, name, np.where(side == 0.0, closing, on_ball - points))
-        for number, place in enumerate(lash_places()):
-            root = np.array([np.interp(place, along, (meet - top)[:, axis]) for axis in range(3)])
+        for number, position in enumerate(lash_places()):
+            root = np.array([np.interp(position, along, (meet - top)[:, axis]) for axis in range(3)])
             # The tip swings down, since the lid turns with the ball.
             self._loop(blink, f"lash_{number:02d}", root + np.array([[0, 0, 0], [0, 0, 0], [0.0, -5.0, 1.0]]))
-            self._loop(wide, f"lash_{number:02d}", np.tile(np.sin(np.pi * place) * np.array([0.0, 2.0, -0.5]), (3, 1)))
+            self._loop(
+                wide, f"lash_{number:02d}", np.tile(np.sin(np.pi * position) * np.array([0.0, 2.0, -0.5]), (3, 1))
+            )
         bag = self._hill((33, 8), (14, 9))
         looks = {
             "eyeLookIn": self._look(-LOOK_SIDEWAYS, 0.0),
@@ -283,7 +285,7 @@ class _Fields:
         return moves
 
     def _closing(self, opened: Array) -> Array:
-        """What makes the lips meet when it is added to ``jawOpen`` at the same weight."""
+        """The shape that makes the lips meet when it is added to ``jawOpen`` at the same weight."""
         mesh = self.mesh
         half = MOUTH_POINTS // 2
         loop = mesh.groups["lip_inner"]
@@ -299,9 +301,9 @@ class _Fields:
             near[mesh.both(name)] = nearness
         moves = (near * share)[:, None] * way * np.array([0.0, 1.0, 1.0])
         # On the lips each vertex goes with its column, and the two sides together close the gap completely.
-        place = np.arange(MOUTH_POINTS)
-        column = np.minimum(place, MOUTH_POINTS - 1 - place)
-        part = np.where(place < half, -UPPER_SHARE, np.where(place > half, 1.0 - UPPER_SHARE, 0.0))
+        position = np.arange(MOUTH_POINTS)
+        column = np.minimum(position, MOUTH_POINTS - 1 - position)
+        part = np.where(position < half, -UPPER_SHARE, np.where(position > half, 1.0 - UPPER_SHARE, 0.0))
         for name in ("lip_border", *LIP_LOOPS[:5]):
             fade = 0.85 if name == "lip_border" else 1.0
             self._loop(moves, name, fade * part[:, None] * gap[column])
@@ -325,7 +327,7 @@ def _outside_ball(points: Array, radius: float) -> Array:
 
 
 def _round_the_eye(upper: Array, lower: Array) -> Array:
-    """Moves of a loop round the eye (24, 3) from those of its upper and its lower half, both (13, 3) with corners."""
+    """Moves of a loop round the eye (24, 3) from its upper and its lower half, both (13, 3) with corners."""
     return np.concatenate([upper, lower[-2:0:-1]])
 
 

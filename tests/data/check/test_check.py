@@ -149,15 +149,6 @@ def test_templates_that_circulate_are_known(copies: Path, monkeypatch: pytest.Mo
     assert f"{other} ({known[other]})" in message(report, "templates_origin")
 
 
-def test_neutral_sequences_are_names_that_biwi_does_not_read(copies: Path) -> None:
-    root = copies / "biwi"
-    (root / "wav" / "F2_e01.wav").rename(root / "wav" / "F2_01.wav")
-    (root / "vertices_npy" / "F2_e01.npy").rename(root / "vertices_npy" / "F2_01.npy")
-    report = check(root, BIWI)
-    assert report.sound
-    assert "1 name not of biwi's form, so not read: F2_01" in message(report, "unknown_name")
-
-
 def test_vocaset_at_60_frames_a_second(fakes: Path) -> None:
     report = check(fakes / "vocaset", VOCASET)
     assert kinds(report) == []

@@ -117,7 +117,7 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         "mesh of another topology",
         lambda r: trimesh.creation.box().export(r / "tiny.ply"),
         {"mesh_broken"},
-        "has 8 vertices, expected 24",
+        "has 8 vertices, or faces of others; expected 24",
     ),
     ("no region", lambda r: (r / "regions" / "lve.txt").unlink(), {"region_missing"}, "data.lips=all"),
     (
@@ -126,7 +126,12 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
         {"region_broken"},
         "below 24",
     ),
-    ("table without clips", lambda r: (r / "clips.csv").write_text("a,b\n1,2\n"), {"clips_table"}, "no column clip"),
+    (
+        "table without clips",
+        lambda r: (r / "clips.csv").write_text("a,b\n1,2\n"),
+        {"clips_table"},
+        "with the column clip",
+    ),
     ("no training clip", remove_training_clips, {"no_training_clip"}, "nothing can be trained"),
     (
         "manifest of text",

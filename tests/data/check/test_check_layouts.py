@@ -139,33 +139,6 @@ def test_files_are_compared_with_the_manifest(copies: Path) -> None:
     assert check(root, "tests.fakes.tiny.Tiny", quick=True).manifest["changed"] == ["vertices_npy/A_e01.npy"]
 
 
-def test_the_table_groups_equal_findings_and_names_the_first(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = copies / "tiny"
-    for path in sorted((root / "vertices_npy").iterdir())[:9]:
-        array = np.load(path)
-        array[2] = np.nan
-        np.save(path, array)
-    assert run("data check", [str(root), "--corpus", "tests.fakes.tiny.Tiny", "--quiet"]) == 1
-    lines = capsys.readouterr().out.splitlines()
-    (error,) = [line for line in lines if line.startswith("ERROR")]
-    assert error.startswith("ERROR    9 times motion_not_finite, the first: vertices_npy/A_e01.npy: 1 of 14 frames")
-    assert lines[lines.index(error) + 1].strip() == (
-        "also vertices_npy/A_e02.npy, vertices_npy/A_e03.npy, vertices_npy/A_e04.npy and 5 more"
-    )
-    assert lines[-1] == "not sound: 9 errors"
-    train = next(line for line in lines if line.startswith("train "))
-    assert train.split() == ["train", "-", "8", "-", "140", "5.6"]
-
-
-def test_several_processes_find_the_same(copies: Path) -> None:
-    root = copies / "tiny"
-    (root / "vertices_npy" / "B_e03.npy").write_bytes(b"")
-    alone = check(root, "tests.fakes.tiny.Tiny", workers=1).state()
-    together = check(root, "tests.fakes.tiny.Tiny", workers=2).state()
-    assert alone == together
-    assert alone["sound"] is False
-
-
 def test_worker_processes_import_nothing_heavy() -> None:
     program = "import sys, facediff.data.check.clip; assert not {'torch', 'lightning', 'trimesh'} & set(sys.modules)"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, cwd=ROOT)

@@ -18,7 +18,7 @@ from facediff.data.corpus import read_templates
 from facediff.data.packed import packing
 from facediff.data.packed.reader import PackedCorpus
 from facediff.data.packed.unpacking import unpack
-from facediff.data.prepare.runner import write_templates
+from facediff.data.preparation import write_templates
 from facediff.errors import FaceDiffError
 from facediff.utils.checksums import describe_files
 from tests.data.packed.damage import RECORD, TINY, change
@@ -193,22 +193,6 @@ def test_what_is_there_and_was_damaged_since_is_refused(corpus: Path, packed: Pa
     (out / place).unlink()
     with pytest.raises(FaceDiffError, match=place):
         pack(corpus, out, corpus=TINY, workers=1)
-
-
-def test_other_options_and_other_folders_are_refused(corpus: Path, packed: Path, tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"packed otherwise"):
-        pack(corpus, packed, corpus=TINY, tolerance=0.1, workers=1)
-    (tmp_path / "full.zarr").mkdir()
-    (tmp_path / "full.zarr" / "precious").touch()
-    for root, out, word in (
-        (corpus, tmp_path / "full.zarr", "precious"),
-        (corpus, corpus / "out.zarr", str(corpus)),
-        (packed, tmp_path / "out.zarr", "packed already"),
-        (tmp_path / "full.zarr", tmp_path / "out.zarr", "full.zarr"),
-    ):
-        with pytest.raises(FaceDiffError, match=word):
-            pack(root, out, corpus=TINY, workers=1)
-    assert [path.name for path in sorted(tmp_path.iterdir())] == ["full.zarr"]
 
 
 def broken_frame(root: Path) -> str:

@@ -7,19 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from facediff.data.corpus import read_manifest
 from facediff.data.person import import_person
+from facediff.data.person.face_sequences import differing_faces, find_frames
 from facediff.data.person.fitting import loudness, neutral_frames
 from facediff.data.person.importer import cut_points, splits
-from facediff.data.person.motion import differing_faces, find_frames
 from facediff.errors import FaceDiffError
-from facediff.mesh import read_mesh
 from facediff.mesh.flame import Flame
 from facediff.utils.pickles import load_pickle
 from tests.fakes.flame import flame_arrays, write_flame
-from tests.fakes.person import RATE, face, loud, speech, write_objs, write_speech
+from tests.fakes.person import RATE, loud, speech, write_speech
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -32,24 +30,13 @@ def test_files_are_put_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     folder = touch(tmp_path, "take2_10.obj", "take2_9.obj", "take2_0008.OBJ", "take2_12.ply", "._take2_9.obj", "a.txt")
     files = find_frames(folder)
     assert [path.name for path in files.paths] == ["take2_0008.OBJ", "take2_9.obj", "take2_10.obj", "take2_12.ply"]
-    assert (files.places, files.numbers, files.frames) == ([0, 1, 2, 4], [8, 9, 10, 12], 5)
+    assert (files.frames, files.numbers) == ([0, 1, 2, 4], [8, 9, 10, 12])
     assert files.missing() == [(2, 4)]
 
 
 def test_equal_steps_are_no_gaps(tmp_path: Path) -> None:
     files = find_frames(touch(tmp_path, *(f"{2 * i:05d}.ply" for i in range(5, 12))))
-    assert (files.places, files.missing()) == (list(range(7)), [])
-
-
-def test_an_obj_keeps_every_vertex_used_or_not(tmp_path: Path) -> None:
-    path = tmp_path / "face.obj"
-    path.write_text(
-        "o face\r\nv 0 0 0 0.5 0.5 0.5\r\nv 1 0 0 1 1 1\r\nv 1 1 0 1 1 1\r\nv 9 9 9 1 1 1\r\nv 0 1e0 0 1 1 1\r\n"
-        "vt 0 0\r\nvn 0 0 1\r\nf 1/1/1 2/1/1 3/1/1 5/1/1\r\nf -5 -4 -3\r\n"
-    )
-    mesh = read_mesh(path)
-    np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [9, 9, 9], [0, 1, 0]])
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 4], [0, 1, 2]]
+    assert (files.frames, files.missing()) == (list(range(7)), [])
 
 
 def test_faces_are_compared_as_sets_of_triangles() -> None:
@@ -146,10 +133,3 @@ def test_flame_parameters_become_vertices_without_head_pose(tmp_path: Path, form
     true = Flame.read(model).vertices(np.zeros(3), expression.astype("f4"), jaw.astype("f4"))
     np.testing.assert_allclose(made, true, atol=1e-6)
     assert read_manifest(tmp_path / "out")["report"]["has_head_motion"] is False
-
-
-def test_a_frame_s_faces_are_those_that_a_mesh_library_reads(tmp_path: Path) -> None:
-    path = write_objs(tmp_path / "frames", face()[None]) / "frame_1.obj"
-    mesh, theirs = read_mesh(path), trimesh.load(path, process=False, maintain_order=True)
-    np.testing.assert_allclose(mesh.vertices, theirs.vertices)
-    np.testing.assert_array_equal(mesh.faces, theirs.faces)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,10 @@ import pytest
 import soundfile
 
 from facediff.data import Mead3D
+from facediff.data.preparation import PreparationReport, prepare
 from facediff.data.prepare import mead3d
-from facediff.data.prepare.mead3d import find_recordings, find_sounds
-from facediff.data.prepare.motion import read_parameters
-from facediff.data.prepare.runner import PreparationReport, prepare
+from facediff.data.prepare.mead3d import find_sounds
+from facediff.data.reconstructions import read_parameters
 from facediff.errors import FaceDiffError
 from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import Flame
@@ -29,7 +28,6 @@ from tests.fakes.mead3d import (
     parameters_of,
     speech_of,
     write_hdf5,
-    write_mead3d,
     write_raw_emote,
     write_raw_probtalk3d,
     write_wav,
@@ -188,19 +186,6 @@ def test_shared_files_next_to_the_clips(tmp_path: Path, flame: Path) -> None:
     assert sorted(data.assets().templates) == sorted({name[:4] for name in CLIPS})
 
 
-def test_the_fake_of_the_prepared_layout_serves_both_splits(tmp_path: Path) -> None:
-    root = write_mead3d(tmp_path / "mead3d")
-    by_sentence = MiniMead(root=str(root), split="sentence")
-    assert all(by_sentence.clips(split) for split in ("train", "val", "test_a"))
-    assert not by_sentence.clips("test_b")
-    by_identity = MiniMead(root=str(root), split="identity")
-    assert all(by_identity.clips(split) for split in ("train", "val", "test_b"))
-    for data in (by_sentence, by_identity):
-        for split in ("train", *data.test_splits):
-            for sample in data.dataset(split):
-                assert sample.reference_name != sample.name
-
-
 def test_the_sound_of_meads_own_files(tmp_path: Path, flame: Path) -> None:
     """AAC loses a little, but nothing may be shifted: 20 ms are half a frame."""
     raw = write_raw_emote(tmp_path / "raw", clips=PAIR, audio="m4a")
@@ -240,18 +225,6 @@ def test_sound_is_found_in_all_known_folders(tmp_path: Path) -> None:
     assert find_sounds(tmp_path / "video") == {}
 
 
-def test_sound_from_another_folder(tmp_path: Path, flame: Path) -> None:
-    raw = write_raw_emote(tmp_path / "raw", clips=PAIR, audio="wav")
-    (raw / "MEAD").rename(tmp_path / "elsewhere")
-    with pytest.raises(FaceDiffError, match=r"no clip of 3DMEAD can be prepared .*--audio"):
-        prepared(raw, flame)
-    out, report = prepared(raw, flame, audio=tmp_path / "elsewhere")
-    assert sorted(report.clips) == list(PAIR)
-    np.testing.assert_allclose(
-        read_speech(out / "wav" / f"{CLIP}.wav")[1000:5000], speech_of(CLIP, 16_000)[1000:5000], atol=1e-3
-    )
-
-
 def test_several_processes_write_the_same(raw: Path, flame: Path) -> None:
     one, _ = prepared(raw, flame)
     two = raw.parent / "two"
@@ -269,15 +242,6 @@ def test_speakers_that_are_not_there_are_named(raw: Path, flame: Path) -> None:
     assert not [key for key in mead3d.plan(raw, flame=flame, subjects=["M003"]).missing if len(key) == 4]
     with pytest.raises(FaceDiffError, match=r'--subjects: the raw folder has no "M03": did you mean "M003"'):
         mead3d.plan(raw, flame=flame, subjects=["M03"])
-    with pytest.raises(FaceDiffError, match="--subjects: is empty"):
-        mead3d.plan(raw, flame=flame, subjects=[])
-
-
-def test_a_speaker_of_no_split_is_prepared_and_noted(tmp_path: Path, flame: Path) -> None:
-    raw = write_raw_emote(tmp_path / "raw", clips=["M777_001_0_0"], audio="wav")
-    _, report = prepared(raw, flame)
-    assert list(report.clips) == ["M777_001_0_0"]
-    assert any("M777" in note for note in report.notes)
 
 
 def test_a_clip_without_sound_or_without_parameters_is_missing(raw: Path, flame: Path) -> None:
@@ -286,7 +250,7 @@ def test_a_clip_without_sound_or_without_parameters_is_missing(raw: Path, flame:
     extra.parent.mkdir(parents=True)
     _, report = prepared(raw, flame)
     assert list(report.clips) == [CLIP]
-    assert "expected its sound, M003_002_0_0.wav or M003/audio/neutral/level_1/002.m4a" in report.missing[PAIR[1]]
+    assert "expected its sound, M003_002_0_0.wav or M003/audio/…/002.m4a" in report.missing[PAIR[1]]
     assert report.missing["M003_005_0_0"] == f"expected {extra}"
 
 
@@ -312,8 +276,8 @@ def cut(key: str) -> Parts:
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        (without("jaw"), r"has no jaw \(it has exp, shape\); expected shape, exp, jaw"),
-        (without("exp"), r"has no exp"),
+        (without("jaw"), "has no 'jaw'; .*shape, exp, jaw"),
+        (without("exp"), "has no 'exp'"),
         (with_nan("exp"), "NaN or infinity"),
         (with_nan("jaw"), "NaN or infinity"),
         (with_nan("shape"), "NaN or infinity"),
@@ -360,16 +324,6 @@ def test_a_file_that_points_to_other_files_is_refused(raw: Path, tmp_path: Path)
         read_parameters(hdf5(raw))
 
 
-@pytest.mark.parametrize("depth", ["", "EMICA-MEAD_flame2020"])
-def test_the_raw_folder_may_be_given_at_any_depth(depth: str, raw: Path) -> None:
-    deep = raw.parent / "processed" / "reconstructions"
-    deep.mkdir(parents=True)
-    (raw / "EMICA-MEAD_flame2020").rename(deep / "EMICA-MEAD_flame2020")
-    found = find_recordings(deep / depth if depth else raw.parent)
-    assert [recording.name for recording in found.recordings] == list(PAIR)
-    assert found.base == deep / "EMICA-MEAD_flame2020"
-
-
 def test_a_repaired_clip_is_written_by_a_second_run_but_shapes_are_never_mixed(raw: Path, flame: Path) -> None:
     """The repaired clip changes the speaker's mean shape, so that the clip that is there has another."""
     whole = hdf5(raw).read_bytes()
@@ -385,13 +339,3 @@ def test_a_repaired_clip_is_written_by_a_second_run_but_shapes_are_never_mixed(r
     fresh, _ = prepared(raw, flame, "fresh")
     for path in fresh.rglob("*.npy"):
         assert (out / path.relative_to(fresh)).read_bytes() == path.read_bytes()
-
-
-def test_a_folder_is_not_continued_with_another_model_or_shape(raw: Path, flame: Path, tmp_path: Path) -> None:
-    prepared(raw, flame)
-    with pytest.raises(FaceDiffError, match="--flame was a model with SHA-256"):
-        prepared(raw, write_flame(tmp_path / "other.pkl", seed=1))
-    with pytest.raises(FaceDiffError, match="--shape was subject and is clip"):
-        prepared(raw, flame, shape="clip")
-    moved = shutil.copy(flame, tmp_path / "moved.pkl")
-    assert prepared(raw, Path(moved))[1].written == 0

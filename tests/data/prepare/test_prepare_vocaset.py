@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from pathlib import Path
 
@@ -10,8 +9,8 @@ import numpy as np
 import pytest
 import soundfile
 
+from facediff.data.preparation import PreparationReport, prepare
 from facediff.data.prepare import vocaset
-from facediff.data.prepare.runner import PreparationReport, prepare
 from facediff.data.prepare.vocaset import halved, read_samples
 from facediff.errors import FaceDiffError
 from facediff.utils.pickles import load_pickle
@@ -19,7 +18,6 @@ from tests.fakes.vocaset import (
     CLIPS,
     RATE,
     TRAIN,
-    VERTICES,
     frames_of,
     motion_of,
     speech_of,
@@ -94,15 +92,6 @@ def test_filtering_removes_aliasing_frequencies_and_keeps_the_others() -> None:
     assert filtered.shape == (120, 2, 3)
 
 
-def test_the_filtered_option_reaches_the_files(raw: Path) -> None:
-    out, report = prepared(raw, decimate="filtered")
-    assert report.sound
-    motion = np.load(out / "vertices_npy" / f"{CLIP}.npy").reshape(-1, VERTICES, 3)
-    plain = motion_of(TRAIN, "sentence01", 25)[::2]
-    assert abs(len(motion) - len(plain)) <= 1
-    assert 0 < np.abs(motion[:12] - plain[:12]).max() < 0.003
-
-
 def test_speech_is_resampled_to_16_khz(raw: Path) -> None:
     out, _ = prepared(raw)
     samples, rate = soundfile.read(out / "wav" / f"{CLIP}.wav")
@@ -170,14 +159,6 @@ def test_a_row_beyond_the_array_is_refused(raw: Path, row: int) -> None:
     )
 
 
-def test_a_row_that_is_not_finite(raw: Path) -> None:
-    row = load_pickle(raw / "subj_seq_to_idx.pkl")[TRAIN]["sentence01"][6]
-    rows = np.load(raw / "data_verts.npy")
-    rows[row, 3, 1] = np.nan
-    np.save(raw / "data_verts.npy", rows)
-    assert f"frame 6, row {row} of {raw / 'data_verts.npy'}, holds NaN" in problem(raw)
-
-
 def test_frames_are_in_the_order_of_their_numbers_and_gaps_are_noted(raw: Path) -> None:
     change(raw / "subj_seq_to_idx.pkl", "", {4: 9, 0: 3, 2: 7, 1: 5})
     out, report = prepared(raw, frame_rate=60)
@@ -207,20 +188,6 @@ def test_sentences_that_were_never_recorded_are_counted(tmp_path: Path) -> None:
     assert len([name for name in report.missing if "_TA_" in name]) == 40 * (len(CLIPS) - 1) - complete
 
 
-@pytest.mark.parametrize("file", ["subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"])
-def test_a_pickle_that_would_run_code_does_not(raw: Path, monkeypatch: pytest.MonkeyPatch, file: str) -> None:
-    class Bomb:
-        def __reduce__(self) -> tuple[object, tuple[str]]:
-            return os.mkdir, ("bomb-went-off",)
-
-    monkeypatch.chdir(raw)
-    (raw / file).write_bytes(pickle.dumps({TRAIN: Bomb()}, 2))
-    with pytest.raises(FaceDiffError, match=rf"{file}: not a pickle of plain NumPy arrays"):
-        prepared(raw)
-    assert not (raw / "bomb-went-off").exists()
-    assert not (raw.parent / "out").exists()
-
-
 def test_names_from_pickles_cannot_leave_the_folder(raw: Path) -> None:
     for name in ("subj_seq_to_idx.pkl", "raw_audio_fixed.pkl", "templates.pkl"):
         content = load_pickle(raw / name)
@@ -228,16 +195,3 @@ def test_names_from_pickles_cannot_leave_the_folder(raw: Path) -> None:
         (raw / name).write_bytes(pickle.dumps(content))
     with pytest.raises(FaceDiffError, match=r'clip name "\.\./\.\./evil_sentence01"'):
         prepared(raw)
-
-
-def test_mesh_masks_and_regions_are_copied_if_they_are_there(raw: Path, tmp_path: Path) -> None:
-    out, report = prepared(raw)
-    for name in ("FLAME_sample.ply", "FLAME_masks.pkl", "regions/lve.txt", "regions/fdd.txt"):
-        assert (out / name).read_bytes() == (raw / name).read_bytes()
-        assert name not in report.missing
-    bare = write_raw_vocaset(tmp_path / "bare" / "trainingdata", clips={TRAIN: ["sentence01"]}, frames=9, extras=False)
-    report = prepare(vocaset.plan(bare.parent), tmp_path / "bare out", workers=1)
-    assert report.clips == {CLIP: 5}  # frames 0, 2, 4, 6, 8
-    assert "VOCA repository" in report.missing["FLAME_sample.ply"]
-    assert "flame.is.tue.mpg.de" in report.missing["FLAME_masks.pkl"]
-    assert "regions/lve.txt" in report.missing

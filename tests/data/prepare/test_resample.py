@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.data.prepare.motion import resample_frames, resampled_length
+from facediff.data.reconstructions import resample_frames, resampled_length
 
 RATES = [(60, 30), (30, 25), (25, 30), (29.97, 25), (23.976, 30), (30, 60), (100, 25)]
 
@@ -43,20 +43,6 @@ def test_frequencies_above_the_new_nyquist_frequency_are_removed() -> None:
     tremble = np.sin(2 * np.pi * 20 * time)[:, None]
     assert np.abs(tremble[::2]).max() > 0.8
     assert np.abs(resample_frames(tremble, 60, 30)[30:-30]).max() < 1e-3
-
-
-def test_the_same_rate_changes_nothing() -> None:
-    motion = np.random.default_rng(0).normal(size=(130, 4, 3)).astype(np.float32)
-    np.testing.assert_array_equal(resample_frames(motion, 25, 25), motion)
-
-
-def test_shape_type_and_coordinates_are_independent() -> None:
-    motion = np.random.default_rng(0).normal(size=(90, 4, 3)).astype(np.float32)
-    made = resample_frames(motion, 30, 25)
-    assert made.shape == (75, 4, 3)
-    assert made.dtype == np.float32
-    alone = resample_frames(motion[:, 2, 1:2].astype(float), 30, 25)
-    np.testing.assert_allclose(made[:, 2, 1:2], alone, atol=1e-6)
 
 
 def test_resampling_from_disk_to_disk_needs_little_memory(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""``python -m facediff.utils.tethered MODULE WORDS``: runs a module as a program that ends with whoever started it.
+"""``python -m facediff.benchmark.exit_with_parent MODULE WORDS``: runs a module that ends with its parent.
 
 Standard input is a pipe of which the parent holds the other end. When the parent ends, however it ends, the pipe breaks
 and this process is killed: nothing goes on writing into a folder that the parent's successor is about to use. Files

@@ -20,7 +20,7 @@ def hash_source(text: str) -> str:
 
 
 def script_data(facts: Mapping[str, object]) -> str:
-    r"""JSON that cannot end the element it stands in, whatever names are in it; without characters beyond ASCII.
+    r"""JSON that cannot end the element it stands in, for any names in it; without characters beyond ASCII.
 
     Example:
         >>> script_data({"name": "</script>"})

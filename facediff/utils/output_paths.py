@@ -1,4 +1,4 @@
-"""Outputs that are refused before they are written: onto an input, onto each other, or onto what is no regular file."""
+"""Outputs that are refused before they are written: onto an input, onto each other, or onto a device."""
 
 from __future__ import annotations
 
@@ -52,39 +52,32 @@ def protect(inputs: Iterable[Path]) -> None:
 
 
 def refuse_protected(path: Path, *, folder: bool = False) -> None:
-    """Refuse to overwrite a file that is being read, under whatever name; for a folder, one that holds such a file."""
-    place = Path(os.path.realpath(path))
-    if place in _read and place.exists():
-        raise FaceDiffError(_refusal(path, _read[place]))
-    inside = next((source for where, source in _read.items() if place in where.parents), None)
-    if folder and inside is not None:
-        raise FaceDiffError(f"{path}: would be replaced, and {inside} in it is read; choose another output")
+    """Refuse to overwrite a file that is being read, under any name; for a folder, one that holds such a file."""
+    target = Path(os.path.realpath(path))
+    inside = next((source for where, source in _read.items() if folder and target in where.parents), None)
+    source = _read.get(target) if target.exists() else None
+    if source is not None or inside is not None:
+        raise _refusal(path, source or inside)
 
 
 def refuse_overwriting(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
     """Refuse outputs that are inputs, also through a link or as data in a folder that is read."""
     sources = {Path(os.path.realpath(path)): path for path in inputs}
     for path in outputs:
-        place = Path(os.path.realpath(path))
-        if place in sources and place.exists():
-            raise FaceDiffError(_refusal(path, sources[place]))
-        is_data = place.suffix.lower() in DATA_SUFFIXES or place.name in RECORDS or place.parent.name == "phonemes"
-        around = next((sources[folder] for folder in place.parents if folder in sources), None)
-        if is_data and around is not None and place.is_file():
-            raise FaceDiffError(
-                f"{path}: lies in {around}, which is read by this command, and would be overwritten; choose another "
-                f"output, or remove this file first"
-            )
+        target = Path(os.path.realpath(path))
+        is_data = target.suffix.lower() in DATA_SUFFIXES or target.name in RECORDS or target.parent.name == "phonemes"
+        folders = target.parents if is_data and target.is_file() else ()
+        if target.exists() and (source := next((sources[p] for p in (target, *folders) if p in sources), None)):
+            raise _refusal(path, source)
 
 
 def refuse_equal(outputs: Iterable[Path]) -> None:
     """Refuse two outputs that are one file."""
-    places: dict[str, Path] = {}
+    targets: dict[str, Path] = {}
     for path in outputs:
-        if places.setdefault(os.path.realpath(path), path) is not path:
+        if targets.setdefault(os.path.realpath(path), path) is not path:
             raise FaceDiffError(f"{path}: is named for two outputs, of which one would overwrite the other")
 
 
-def _refusal(path: Path, source: Path) -> str:
-    also = "" if os.fspath(path) == os.fspath(source) else f" as {source}"
-    return f"{path}: is read by this command{also} and would be overwritten; choose another output"
+def _refusal(path: Path, source: Path | None) -> FaceDiffError:
+    return FaceDiffError(f"{path}: would be overwritten, but this command reads {source}; choose another output")

@@ -42,7 +42,7 @@ def peak(scores: Array) -> float:
     best = int(scores.argmax())
     shift = 0.0
     if 0 < best < len(scores) - 1 and np.isfinite(scores[best - 1 : best + 2]).all():
-        before, here, after = scores[best - 1 : best + 2]
-        curve = before - 2 * here + after
+        before, middle, after = scores[best - 1 : best + 2]
+        curve = before - 2 * middle + after
         shift = 0.5 * float(before - after) / float(curve) if curve < 0 else 0.0
     return best - (len(scores) - 1) / 2 + shift

@@ -18,12 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.manifest import FORMAT, load_manifest
-from facediff.errors import FaceDiffError, choices, needs_extra
+from facediff.errors import FaceDiffError, choices, damaged, needs_extra
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import begin_folder, run_batch
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic, check_writable, locked, remove_partial
 from facediff.utils.plain_files import parse_json, write_json
+from facediff.utils.records import read_record
 from facediff.utils.workers import processors
 
 Precision = Literal["float32", "float64"]
@@ -77,7 +78,7 @@ class PreparationPlan:
     # writes what clips share (templates.pkl, mesh, regions/, clips.csv) and returns the paths of those files, relative
     # to the output folder. Runs in the calling process; may run again
     shared: Callable[[Path], list[str]]
-    # clips and files that the raw folder lacks, and what was expected where
+    # clips and files that the raw folder lacks, each with the expected place
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # other remarks for the user, one sentence each
 
@@ -100,7 +101,7 @@ class PreparationReport:
     clips: dict[str, int]  # frames of every clip that is there now
     written: int  # number of clips written by this run; the others were there
     failed: dict[str, str]  # reasons by clip
-    missing: dict[str, str]  # clips and files that the raw folder lacks, and what was expected where
+    missing: dict[str, str]  # clips and files that the raw folder lacks, each with the expected place
     notes: list[str]
     totals: dict[str, Any]  # counts, as in the manifest
 
@@ -121,7 +122,7 @@ def prepare(
 ) -> PreparationReport:
     """Write a corpus folder.
 
-    A run that was killed is resumed: clips whose two files are there are kept. A second run over a complete folder
+    A run that was killed is resumed: clips with both files are kept. A second run over a complete folder
     changes nothing. A clip that fails does not stop the others.
 
     Args:
@@ -136,30 +137,30 @@ def prepare(
     with locked(out / LOCK, "facediff data prepare"):
         manifest = _read_manifest(out / MANIFEST)
         recorded = {} if manifest is None else manifest.get("files", {})
-        finished = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out, recorded))}
-        if manifest is not None and not (out / STATE).exists() and _is_complete(plan, finished, out, manifest):
+        complete = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out, recorded))}
+        if manifest is not None and not (out / STATE).exists() and _is_complete(plan, complete, out, manifest):
             return _report(plan, out, manifest, 0)
         _refuse_strays(plan, out)
-        pending = [job for job in plan.jobs if job.name not in finished]
+        pending = [job for job in plan.jobs if job.name not in complete]
         _check_space(plan, pending, out)
         # A run may be killed at any time, so the state marks the folder as unfinished before the first clip appears,
         # and is removed only once the manifest is written: readers refuse a folder with a state and without a manifest.
         begin_folder(out, STATE, plan.recipe, "facediff data prepare", None if manifest is None else settings(manifest))
-        places = {"workers": workers, "scheduler": scheduler, "writes": out, "reads": reads}
-        return _write_all(plan, pending, finished, out, places, quiet)
+        options = {"workers": workers, "scheduler": scheduler, "writes": out, "reads": reads}
+        return _write_all(plan, pending, complete, out, options, quiet)
 
 
 def _write_all(
     plan: PreparationPlan,
     pending: list[Job],
-    finished: dict[str, int],
+    complete: dict[str, int],
     out: Path,
-    places: Mapping[str, Any],
+    options: Mapping[str, Any],
     quiet: bool,
 ) -> PreparationReport:
     shared = plan.shared(out)
-    clips, failed = dict(finished), {}
-    outcomes = run_batch(methodcaller("work", out), pending, **places, progress="" if quiet else plan.corpus)
+    clips, failed = dict(complete), {}
+    outcomes = run_batch(methodcaller("work", out), pending, **options, progress="" if quiet else plan.corpus)
     with closing(outcomes):
         for job, outcome in outcomes:
             if outcome.result is None:
@@ -170,11 +171,13 @@ def _write_all(
                 clips[job.name] = outcome.result
     remove_partial(out, recursive=True)  # of a worker of a cluster that was lost
     names = [*shared, *(file.relative_to(out).as_posix() for name in clips for file in clip_files(out, name))]
-    files = describe_files(out, names, workers=places["workers"] or processors(), progress="" if quiet else "checksums")
+    files = describe_files(
+        out, names, workers=options["workers"] or processors(), progress="" if quiet else "checksums"
+    )
     manifest = _manifest(plan, clips, failed, files)
     write_json(out / MANIFEST, manifest)
     (out / STATE).unlink()
-    return _report(plan, out, manifest, len(clips) - len(finished))
+    return _report(plan, out, manifest, len(clips) - len(complete))
 
 
 def _manifest(
@@ -194,7 +197,7 @@ def _manifest(
             "clips": len(clips),
             "frames": frames,
             "seconds": round(frames / plan.frame_rate, 3),
-            "bytes": sum(int(facts["bytes"]) for facts in files.values()),
+            "bytes": sum(int(file["bytes"]) for file in files.values()),
         },
         "clips": dict(sorted(clips.items())),
         "missing": plan.missing,
@@ -222,7 +225,7 @@ def version() -> str:
 
 
 def finished_frames(plan: PreparationPlan, job: Job, out: Path, recorded: Mapping[str, Any]) -> int | None:
-    """Frames of a clip whose motion and speech were both written completely; None for any other.
+    """Frames of a clip with complete files of motion and speech; None for any other.
 
     Files that an earlier manifest records have the sizes that it records.
     """
@@ -236,27 +239,36 @@ def finished_frames(plan: PreparationPlan, job: Job, out: Path, recorded: Mappin
         array = open_array(motion)
     except (OSError, FaceDiffError):
         return None
-    whole = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == plan.dtype
-    return len(array) if whole else None
+    complete = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == plan.dtype
+    return len(array) if complete else None
 
 
-def _is_complete(plan: PreparationPlan, finished: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
+def _is_complete(plan: PreparationPlan, complete: dict[str, int], out: Path, manifest: dict[str, Any]) -> bool:
     """Whether the manifest records just this plan, carried out without a failure, and all its files are there."""
     # A newer version of facediff accepts a complete folder of an older one; it only refuses to continue it.
     expected = {**plan.recipe, "facediff": manifest.get("facediff")}
-    parts = {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": finished}
+    parts = {"missing": plan.missing, "notes": plan.notes, "failed": {}, "clips": complete}
     return (
         settings(manifest) == parse_json(json.dumps(expected), MANIFEST)
-        and len(finished) == len(plan.jobs)
+        and len(complete) == len(plan.jobs)
         and all(manifest.get(name) == value for name, value in parts.items())
         and same_sizes(out, manifest.get("files", {}))
     )
 
 
 def settings(record: Mapping[str, Any]) -> dict[str, Any]:
-    """What a manifest says of how its folder was written; options as the user gives them."""
+    """The settings of the run that wrote a folder, from its manifest; options as the user gives them."""
     options = {f"--{name.replace('_', '-')}": value for name, value in record["options"].items()}
     return {"facediff": record.get("facediff"), "corpus": record["corpus"], **options}
+
+
+@dataclass(frozen=True)
+class PreparedFolder:
+    """The fields by which a manifest tells that ``facediff data prepare`` wrote its folder."""
+
+    corpus: str
+    options: Mapping[str, Any]
+    files: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _read_manifest(path: Path) -> dict[str, Any] | None:
@@ -264,20 +276,16 @@ def _read_manifest(path: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     record = load_manifest(path, remedy=f"remove {path.parent}, or choose another folder")
-    parts = (record.get("options"), record.get("files", {}))
-    if not all(isinstance(part, dict) for part in parts) or "corpus" not in record:
-        raise FaceDiffError(f"{path}: not written by `facediff data prepare`; choose another folder to write to")
+    read_record(PreparedFolder, record, path, remedy="choose another folder to write to", strict=False)
     return record
 
 
 def _refuse_strays(plan: PreparationPlan, out: Path) -> None:
     """Refuse clips that the raw folder no longer has: training would read them, but no manifest lists them."""
     names = {job.name for job in plan.jobs}
-    for path in (*sorted(out.glob("vertices_npy/*.npy")), *sorted(out.glob("wav/*.wav"))):
-        if not path.name.startswith(".") and path.stem not in names:
-            raise FaceDiffError(
-                f"{path}: is no clip of the raw folder (any more); remove the file, or choose another folder"
-            )
+    paths = (*sorted(out.glob("vertices_npy/[!.]*.npy")), *sorted(out.glob("wav/[!.]*.wav")))
+    if stray := next((path for path in paths if path.stem not in names), None):
+        raise FaceDiffError(f"{stray}: is no clip of the raw folder (any more); remove it, or choose another folder")
 
 
 def _check_space(plan: PreparationPlan, pending: list[Job], out: Path) -> None:
@@ -287,10 +295,10 @@ def _check_space(plan: PreparationPlan, pending: list[Job], out: Path) -> None:
     # Some frame counts are known only once a clip is read; these clips are taken to be of mean length.
     frames = sum(frame_counts) / len(frame_counts) * len(pending)
     need = frames * (3 * plan.n_vertices * plan.dtype.itemsize + 2 * 16_000 / plan.frame_rate)
-    free = shutil.disk_usage(out).free
-    if need > free:
+    space = shutil.disk_usage(out).free
+    if need > space:
         raise FaceDiffError(
-            f"{out}: about {need / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free; make room, choose another "
+            f"{out}: about {need / 1e9:.1f} GB are needed and {space / 1e9:.1f} GB are free; make room, choose another "
             f"disk, or prepare fewer subjects"
         )
 
@@ -319,16 +327,11 @@ def write_clip(
 
 def write_motion(path: Path, vertices: npt.NDArray[np.floating], dtype: Precision = "float32") -> None:
     """Write absolute vertices (T, V, 3) as a (T, 3V) array, atomically."""
-    frames = len(vertices)
-    if not frames:
-        raise FaceDiffError(f"{path.stem}: has no frame; expected at least one")
-    finite = np.isfinite(vertices).reshape(frames, -1).all(axis=1)
-    if not finite.all():
-        raise FaceDiffError(
-            f"{path.stem}: frame {int(np.argmin(finite))} (counted from 0) holds NaN or infinity; leave the clip out "
-            f"or get it again"
-        )
-    rows = np.ascontiguousarray(vertices.reshape(frames, -1), dtype=dtype)
+    rows = np.ascontiguousarray(vertices.reshape(len(vertices), vertices[0].size if len(vertices) else 0), dtype=dtype)
+    finite = np.isfinite(rows).all(axis=1)
+    if not len(rows) or not finite.all():
+        fault = f"frame {int(np.argmin(finite))} (counted from 0) holds NaN or infinity" if len(rows) else "no frame"
+        raise FaceDiffError(f"{path.stem}: {fault}; get the clip again or leave it out")
     with atomic(path) as temporary:
         np.save(temporary, rows, allow_pickle=False)
 
@@ -340,9 +343,9 @@ def write_speech(path: Path, speech: npt.NDArray[np.floating]) -> None:
     """
     from facediff.speech.audio import SAMPLE_RATE, write_wav
 
-    whole = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
+    samples = np.clip(np.rint(np.asarray(speech, np.float64) * 32768), -32768, 32767).astype(np.int16)
     with atomic(path) as temporary:
-        write_wav(temporary, whole, SAMPLE_RATE)
+        write_wav(temporary, samples, SAMPLE_RATE)
 
 
 def write_templates(path: Path, templates: Mapping[str, npt.NDArray[np.floating]]) -> None:
@@ -383,17 +386,13 @@ def copy_files(sources: Sequence[Path], out: Path, folder: str = "") -> list[str
 
 def bases(raw: Path) -> list[Path]:
     """The raw folder and the folders in it, sorted and without hidden ones: where a data set may begin."""
-    if not raw.is_dir():
-        raise FaceDiffError(f"{raw}: no such folder; expected the raw data set as it was distributed, unpacked")
     return [raw, *folders_in(raw)]
 
 
 def folders_in(folder: Path) -> list[Path]:
     """Folders in a folder, sorted, without hidden ones."""
-    try:
+    with damaged(folder, "expected the folder of a data set, unpacked", OSError):
         return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    except OSError as error:
-        raise FaceDiffError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
 
 
 def find_file(raw: Path, name: str) -> Path | None:
@@ -401,26 +400,25 @@ def find_file(raw: Path, name: str) -> Path | None:
     return next((path for base in bases(raw) if (path := base / name).is_file()), None)
 
 
-def find_regions(raw: Path, chosen: Path | None) -> list[Path]:
+def find_regions(raw: Path, regions: Path | None) -> list[Path]:
     """The lists of vertices in the folder given, else in ``regions/`` of the raw folder if there is one."""
-    folder = chosen or next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
+    folder = regions or next((path for base in bases(raw) if (path := base / "regions").is_dir()), None)
     files = [] if folder is None else sorted(path for path in folder.glob("*.txt") if path.is_file())
-    if chosen is not None and not files:
-        raise FaceDiffError(f"{chosen}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
+    if regions is not None and not files:
+        raise FaceDiffError(f"{regions}: expected a folder with lists of vertices, e.g. lve.txt and fdd.txt")
     return files
 
 
 def choose_subjects(subjects: Sequence[str] | None, available: Sequence[str], holder: str) -> list[str]:
     """The subjects that ``--subjects`` names, in the order in which they are known; all if None."""
-    if subjects is not None and not subjects:
-        raise FaceDiffError(f"--subjects: is empty; expected e.g. {','.join(available[:2])}")
     for subject in subjects or ():
         if subject not in available:
             raise FaceDiffError(f'--subjects: {holder} has no "{subject}": {choices(subject, available)}')
     return [subject for subject in available if subjects is None or subject in subjects]
 
 
-def nothing_to_prepare(raw: Path, corpus: str, missing: Mapping[str, str]) -> FaceDiffError:
-    """The error for a raw folder without a complete clip."""
-    reasons = "; ".join(f"{name}: {text}" for name, text in list(missing.items())[:3])
-    return FaceDiffError(f"{raw}: no clip of {corpus} can be prepared ({reasons or 'there is none'})")
+def refuse_empty(raw: Path, corpus: str, jobs: Sequence[Job], gaps: Mapping[str, str]) -> None:
+    """Refuse a raw folder without a complete clip."""
+    if not jobs:
+        reasons = "; ".join(f"{name}: {text}" for name, text in list(gaps.items())[:3])
+        raise FaceDiffError(f"{raw}: no clip of {corpus} can be prepared ({reasons or 'there is none'})")

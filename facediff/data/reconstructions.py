@@ -49,18 +49,14 @@ def resample_frames(
         out: where to write, shape (round(T · rate_out / rate_in), C); a new array of ``motion``'s type if None.
     """
     length = resampled_length(len(motion), rate_in, rate_out)
-    if length < 1:
-        raise FaceDiffError(
-            f"motion of {len(motion)} frames at {rate_in:g} frames a second: too short for {rate_out:g} frames a second"
-        )
     out = np.empty((length, *motion.shape[1:]), motion.dtype) if out is None else out
     if rate_in == rate_out:
         for first in range(0, length, BLOCK):
             out[first : first + BLOCK] = motion[first : first + BLOCK]
         return out
-    for written, used, weights in _blocks(len(motion), length, rate_in, rate_out):
-        rows = np.asarray(motion[used], np.float64)
-        out[written] = (weights @ rows.reshape(len(rows), -1)).reshape(-1, *motion.shape[1:])
+    for target, source, weights in _blocks(len(motion), length, rate_in, rate_out):
+        rows = np.asarray(motion[source], np.float64)
+        out[target] = (weights @ rows.reshape(len(rows), -1)).reshape(-1, *motion.shape[1:])
     return out
 
 
@@ -143,12 +139,6 @@ def read_parameters(path: Path) -> FlameParameters:
 
 
 def _read_array(path: Path) -> dict[str, Array]:
-    array = open_array(path, kinds="f")
-    if array.shape[-1:] != (FLAME_WIDTH,):
-        raise FaceDiffError(
-            f"{path}: holds {array.dtype} {array.shape}; expected floats of shape (1, frames, {FLAME_WIDTH}), FLAME "
-            f"parameters"
-        )
-    joined = as_frames(array, FLAME_WIDTH, f"{path}: the array", exact=True)
+    joined = as_frames(open_array(path, kinds="f"), FLAME_WIDTH, f"{path}: the array", exact=True)
     ends = np.cumsum(list(WIDTHS.values()))
     return dict(zip(WIDTHS, np.split(joined, ends[:-1], axis=1), strict=True))

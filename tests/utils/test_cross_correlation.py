@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from facediff.utils.lags import correlations, lagged_correlation, peak
+from facediff.utils.cross_correlation import correlations, lagged_correlation, peak
 
 
 @pytest.mark.parametrize("late", [0.0, 1.0, -2.4, 3.5])

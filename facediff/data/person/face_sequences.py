@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.prepare.motion import read_parameters
+from facediff.data.reconstructions import read_parameters
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh, read_mesh
 from facediff.mesh.flame import Flame
@@ -52,9 +52,7 @@ def read_motion(
             path, n_vertices=n_vertices, frame_rate=frame_rate, scratch=scratch, progress=progress
         )
         return FaceSequence(frames, faces, notes=notes)
-    if path.suffix.lower() in HDF5_SUFFIXES:
-        raise FaceDiffError(f"{path}: holds FLAME parameters; add --flame MODEL, your own FLAME model file")
-    array = open_array(path, kinds="f")
+    array = np.empty(0) if path.suffix.lower() in HDF5_SUFFIXES else open_array(path, kinds="f")
     if vertices_of(array.shape) != n_vertices:
         raise FaceDiffError(
             f"{path}: has shape {array.shape}; expected (frames, {n_vertices}, 3) or (frames, {3 * n_vertices}) like "
@@ -97,55 +95,45 @@ def read_frames(
     gaps = files.missing()
     for before, after in gaps:
         if after - before - 1 > MAX_GAP * frame_rate:
-            here = files.places.index(before)
+            index = files.frames.index(before)
             raise FaceDiffError(
-                f"{folder}: {after - before - 1} frames are missing between {files.paths[here].name} and "
-                f"{files.paths[here + 1].name}; at most {MAX_GAP} s can be filled, so cut the video there"
+                f"{folder}: {after - before - 1} frames are missing between {files.paths[index].name} and "
+                f"{files.paths[index + 1].name}; at most {MAX_GAP} s can be filled, so cut the video there"
             )
-    frames = scratch_array(scratch, (files.frames, n_vertices, 3))
+    frames = scratch_array(scratch, (files.frames[-1] + 1, n_vertices, 3))
     first: Mesh | None = None
-    for path, place in zip(track(files.paths, "reading meshes", shown=progress), files.places, strict=True):
+    for path, frame in zip(track(files.paths, "reading meshes", shown=progress), files.frames, strict=True):
         mesh = read_mesh(path, points_allowed=True)
         first = first or mesh
-        _check(path, mesh, files.paths[0], first, n_vertices)
-        frames[place] = mesh.vertices
+        same = np.array_equal(mesh.faces, first.faces) or not differing_faces(mesh.faces, first.faces)
+        if not same or len(mesh.vertices) != n_vertices or not np.isfinite(mesh.vertices).all():
+            raise FaceDiffError(
+                f"{path}: has {len(mesh.vertices)} vertices, NaN among them, or other faces than "
+                f"{files.paths[0].name}; expected {n_vertices} finite ones in one topology, as the corpus has"
+            )
+        frames[frame] = mesh.vertices
     for before, after in gaps:
-        for place in range(before + 1, after):
-            share = (place - before) / (after - before)
-            frames[place] = (1 - share) * frames[before] + share * frames[after]
-    filled = [place for before, after in gaps for place in range(before + 1, after)]
+        for frame in range(before + 1, after):
+            share = (frame - before) / (after - before)
+            frames[frame] = (1 - share) * frames[before] + share * frames[after]
+    filled = [frame for before, after in gaps for frame in range(before + 1, after)]
     notes = [f"{len(filled)} missing frames filled from their neighbours: {spans(filled)}"] if filled else []
-    if files.numbers[-1] - files.numbers[0] > files.places[-1]:
+    if files.numbers[-1] - files.numbers[0] > files.frames[-1]:
         notes.append("the files' numbers go up in equal steps of more than one; they are read as consecutive frames")
     return frames, first.faces if first is not None and len(first.faces) else None, notes
 
 
-def _check(path: Path, mesh: Mesh, first_path: Path, first: Mesh, n_vertices: int) -> None:
-    if len(mesh.vertices) != n_vertices or not np.isfinite(mesh.vertices).all():
-        raise FaceDiffError(
-            f"{path}: has {len(mesh.vertices)} vertices, or NaN among them; expected {n_vertices} finite ones like the "
-            f"corpus"
-        )
-    if not np.array_equal(mesh.faces, first.faces) and differing_faces(mesh.faces, first.faces):
-        raise FaceDiffError(f"{path}: its faces differ from those of {first_path.name}; expected one topology")
-
-
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of a folder in order, their numbers, and places in time from 0; a skipped place is a missing frame."""
+    """The files of a folder in order, their numbers, and their frames from 0, of which some may be missing."""
 
     paths: list[Path]
-    places: list[int]
+    frames: list[int]
     numbers: list[int]
 
-    @property
-    def frames(self) -> int:
-        """Number of frames, including missing ones."""
-        return self.places[-1] + 1
-
     def missing(self) -> list[tuple[int, int]]:
-        """Stretches of missing frames: place of the last frame before, and of the first one after."""
-        return [(a, b) for a, b in zip(self.places, self.places[1:], strict=False) if b - a > 1]
+        """Stretches of missing frames: the last frame before, and the first one after."""
+        return [(a, b) for a, b in zip(self.frames, self.frames[1:], strict=False) if b - a > 1]
 
 
 def find_frames(folder: Path) -> FrameFiles:
@@ -163,20 +151,16 @@ def find_frames(folder: Path) -> FrameFiles:
     column = varying[0] if varying else figures.shape[1] - 1
     order = sorted(range(len(paths)), key=lambda i: figures[i, column])
     paths, numbers = [paths[i] for i in order], [int(figures[i, column]) for i in order]
-    return FrameFiles(paths, _places(numbers), numbers)
-
-
-def _places(numbers: list[int]) -> list[int]:
-    """Places from 0; equal steps of more than one mean that a tool kept every second (third …) frame, not gaps."""
+    # Equal steps of more than one mean that a tool kept every second (third …) frame, not gaps.
     steps = {b - a for a, b in zip(numbers, numbers[1:], strict=False)}
     step = min(steps, default=1)
-    step = step if all(other % step == 0 for other in steps) else 1
-    return [(number - numbers[0]) // step for number in numbers]
+    step = step if all(distance % step == 0 for distance in steps) else 1
+    return FrameFiles(paths, [(number - numbers[0]) // step for number in numbers], numbers)
 
 
-def differing_faces(one: Faces, other: Faces) -> int:
+def differing_faces(faces: Faces, reference: Faces) -> int:
     """How many triangles two lists do not share; order of triangles and of their corners does not count."""
-    first, second = (np.unique(np.sort(faces, axis=1), axis=0) for faces in (one, other))
+    first, second = (np.unique(np.sort(triangles, axis=1), axis=0) for triangles in (faces, reference))
     _, counts = np.unique(np.concatenate([first, second]), axis=0, return_counts=True)
     return int(np.count_nonzero(counts == 1))
 
@@ -191,17 +175,17 @@ def scratch_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]
     return array
 
 
-def spans(places: list[int]) -> str:
+def spans(numbers: list[int]) -> str:
     """Sorted whole numbers in short: ``3-7, 12``; an ellipsis after ten spans.
 
     >>> spans([3, 4, 5, 12])
     '3-5, 12'
     """
     parts: list[list[int]] = []
-    for place in places:
-        if parts and place == parts[-1][1] + 1:
-            parts[-1][1] = place
+    for number in numbers:
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
         else:
-            parts.append([place, place])
+            parts.append([number, number])
     texts = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
     return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "…"])
