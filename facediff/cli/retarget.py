@@ -208,11 +208,11 @@ def pick_on_page(animation: Animation, target: Path, options: TransferOptions, p
         picked,
         names=(animation.name, target.name),
         start=options.landmarks,
-        shown=named_triangles(target, options.part) if options.part else None,
+        face_triangles=named_triangles(target, options.part) if options.part else None,
         parts=mesh_parts(target),
         host=page.host,
         port=page.port or 0,
-        ready=page.announce("shows both faces: pick the same places and save; Ctrl-C ends the command", "pick"),
+        announce=page.announce("shows both faces: pick the same places and save; Ctrl-C ends the command", "pick"),
     )
     if not saved:
         raise FaceDiffError("--pick: no landmarks were saved; save them on the page, or omit --pick")

@@ -156,13 +156,19 @@ class Weights:
             eyes=columns(self.eyes),
         )
 
-    def tracks(self, viseme_set: VisemeSet) -> Weights:
-        """The weights as visemes, ``oculus`` or ``vrm``; see :func:`facediff.spaces.visemes.visemes`."""
+    def arkit_columns(self, purpose: object) -> list[int]:
+        """The columns with names of ARKit's; refused if there are none, for a purpose such as a file."""
         columns = [index for index, name in enumerate(self.names) if name in ARKIT]
         if not columns:
             raise OptionError.naming(
-                "{shapes}: none of the shapes has a name of ARKit's, from which visemes are computed; rename them"
+                f"{purpose}: none of the shapes ({', '.join(self.names[:3])} …) has a name of ARKit's; "
+                f"rename them, or write a table of their own names with {{plain}}"
             )
+        return columns
+
+    def tracks(self, viseme_set: VisemeSet) -> Weights:
+        """The weights as visemes, ``oculus`` or ``vrm``; see :func:`facediff.spaces.visemes.visemes`."""
+        columns = self.arkit_columns("visemes")
         space = Space("arkit", tuple(self.names[index] for index in columns))
         values, target = visemes(self.values[:, columns], space, viseme_set)
         about = {**self.metadata, "tracks": viseme_set}
@@ -264,11 +270,6 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         array([[0.5]])
     """
     options = options or SolveOptions()
-    if shapes.deltas.shape[1] != len(animation.template):
-        raise FaceDiffError(
-            f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give "
-            f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
-        )
     animation.refuse_not_finite()
     head, animation = animation.head, animation.still()
     moving = moving_shapes(animation, shapes, options)
@@ -480,12 +481,7 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
         weights: the weights.
         key_tolerance: as :meth:`Weights.save` takes it.
     """
-    column = {name: index for index, name in enumerate(weights.names)}
-    if not any(name in column for name in ARKIT):
-        raise OptionError.naming(
-            f"{path}: none of the shapes ({', '.join(weights.names[:3])} …) has a name of ARKit's, which are this "
-            f"table's columns; rename them, or write a table of their own names with {{plain}}"
-        )
+    weights.arkit_columns(path)
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]
     row_times = [*times, SURELY_SIXTIETHS] if times and times[-1] < SURELY_SIXTIETHS else times
     values, unknown = live_link_values(weights)

@@ -62,25 +62,21 @@ def brows_of(
         neutral, triangles, _ = built_in_shapes("F1")
         lender = known_face(neutral, triangles)
         assert lender is not None  # noqa: S101 - for type checkers
-        fields = carried(neutral, triangles, np.stack([lender.brows_up, lender.brows_down]), template, faces)
-        if fields is None or not np.abs(fields).max(axis=(1, 2)).all():
-            raise OptionError.naming(
-                'brows: they are not known for this face; list their vertices as "brows" in the file of {eyes}, or '
-                "give a mesh with triangles and an open line between the lips"
-            )
+        fields = carried("brows", neutral, triangles, np.stack([lender.brows_up, lender.brows_down]), template, faces)
     else:
         fields = np.stack([puppet.brows_up, puppet.brows_down])
     return Brows(*(_one_millimetre(field, unit) for field in fields))
 
 
 def carried(
+    name: str,
     neutral: Array,
     triangles: npt.NDArray[np.integer],
     fields: Array,
     template: npt.NDArray[np.floating],
     faces: npt.NDArray[np.integer] | None,
-) -> Array | None:
-    """Displacements (K, V, 3) of a built-in face on another one, in its unit; None if no face is found in it."""
+) -> Array:
+    """Displacements (K, V, 3) of a built-in face on another one, in its unit; refused if no face is found in it."""
     from facediff.editing.correspondence import correspond
     from facediff.editing.face_features import find_features
     from facediff.editing.retargeting import transfer_displacements
@@ -94,8 +90,13 @@ def carried(
             find_features(correspondence.source_vertices, correspondence.source_faces),
         )
         if features is not None and not correspondence.fits_badly:
-            return transfer_displacements(correspondence, fields)
-    return None
+            moved = transfer_displacements(correspondence, fields)
+            if moved.any():
+                return moved
+    raise OptionError.naming(
+        f"{name}: no face is found in this mesh, so that the built-in face's cannot be carried to it; give a mesh with "
+        f"triangles and an open line between the lips, list brows in the file of {{eyes}}, or omit the keys"
+    )
 
 
 def _one_millimetre(field: npt.ArrayLike, unit: str) -> npt.NDArray[np.float32]:

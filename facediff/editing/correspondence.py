@@ -282,19 +282,16 @@ def refuse_other_mesh(
     expected_faces: npt.NDArray[np.integer],
 ) -> None:
     """Require the triangles of the mesh that a correspondence was made for; vertices may have moved."""
-    if len(vertices) != len(expected_vertices):
-        raise FaceDiffError(
-            f"{name}: has {len(vertices)} vertices, and the correspondence was made for a mesh of "
-            f"{len(expected_vertices)}; give that mesh, or make a new correspondence"
-        )
-    if np.array_equal(faces, expected_faces):
+    if len(vertices) == len(expected_vertices) and np.array_equal(faces, expected_faces):
         return
-    extent = float(np.ptp(expected_vertices, axis=0).max())
-    # Rows sorted by position, rounding aside, so that the order of the vertices does not matter.
-    meshes = (np.asarray(points, np.float64) for points in (vertices, expected_vertices))
-    first, second = (rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)] for rows in meshes)
-    reordered = np.abs(first - second).max() <= 2 * ROUNDED * extent
-    reason = "its vertices were reordered, as exporters do" if reordered else "it is another mesh"
+    reason = f"it has {len(vertices)} vertices, not {len(expected_vertices)}"
+    if len(vertices) == len(expected_vertices):
+        extent = float(np.ptp(expected_vertices, axis=0).max())
+        # Rows sorted by position, rounding aside, so that the order of the vertices does not matter.
+        meshes = (np.asarray(points, np.float64) for points in (vertices, expected_vertices))
+        first, second = (rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)] for rows in meshes)
+        reordered = np.abs(first - second).max() <= 2 * ROUNDED * extent
+        reason = "its vertices were reordered, as exporters do" if reordered else "it is another mesh"
     raise FaceDiffError(
         f"{name}: has other triangles than the correspondence's mesh: {reason}; give the mesh that it was made for "
         f"with the order of its vertices kept, or make a new correspondence"

@@ -270,7 +270,7 @@ class Direction:
             content = parse_json(content, source)
         if isinstance(content, list):
             content = {"keys": content}
-        record = read_record(_Content, content, source)
+        record = read_record(_Content, content, source, remedy="give keys over time, .json or .csv")
         check_format(source, f"{record.format} {record.version}", f"{FORMAT} {VERSION}")
         keys = tuple(_read_keys(enumerate(record.keys, 1), source, record.frame_rate or frame_rate))
         return cls(keys, source, record.instead_of)
@@ -351,19 +351,15 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
     if is_mood(path):
         return Direction(MOODS[str(path)], str(path))
     path = Path(path)
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected keys over time, .json or .csv, or {', '.join(MOODS)}")
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return Direction(tuple(_read_keys(_csv_rows(path), str(path), frame_rate)), str(path))
     if suffix == ".npz":
         from facediff.animation import read_archive
 
-        text = read_archive(path).metadata.get(METADATA)
-        if text is None:
-            raise FaceDiffError(f"{path}: was made without a direction; give keys over time, .json or .csv")
-        return Direction.parse(text, str(path), frame_rate)
-    return Direction.parse(load_json(path), str(path), frame_rate)
+        return Direction.parse(read_archive(path).metadata.get(METADATA), str(path), frame_rate)
+    content = load_json(path, remedy=f"expected keys over time, .json or .csv, or {', '.join(MOODS)}")
+    return Direction.parse(content, str(path), frame_rate)
 
 
 def direction_of(animation: Animation) -> Direction | None:

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.animation import metres_per_unit
-from facediff.errors import OptionError
 
 Fields = Mapping[str, npt.NDArray[np.float32]]
 
@@ -37,12 +36,7 @@ def shapes_of(
     rig = built_in_rig("F1")
     assert rig.faces is not None  # noqa: S101 - for type checkers
     deltas = np.stack([rig.deltas[rig.names.index(name)] for name in names])
-    moved = carried(rig.neutral, rig.faces, deltas, template, faces)
-    if moved is None:
-        raise OptionError.naming(
-            "shape: no face is found in this mesh, so that ARKit's shapes cannot be carried to it; give a mesh with "
-            "triangles whose mouth can open, or omit the keys of shape"
-        )
+    moved = carried("shape", rig.neutral, rig.faces, deltas, template, faces)
     return dict(zip(names, np.asarray(moved, np.float32), strict=True))
 
 

@@ -125,9 +125,7 @@ def retarget(
             carried, correspondence = attempt(common)
     except FaceDiffError as error:
         names = [] if parts else parts_with_a_face(animation, mesh_path, mesh)
-        if not names:
-            raise
-        hint = f". A face was found in these of its parts: {', '.join(names)}; try {{part}} {names[0]}"
+        hint = f". A face was found in these of its parts: {', '.join(names)}; try {{part}} {names[0]}" if names else ""
         raise error.followed_by(hint) from error
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)

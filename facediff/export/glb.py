@@ -1,4 +1,4 @@
-"""glTF 2.0 in one binary file: a mesh whose morph targets are animated.
+"""glTF 2.0 in one binary file: a mesh with animated morph targets.
 
 Source: Khronos Group, glTF 2.0 Specification. Metres, y up, the face looks along +z, as the standard prescribes.
 """
@@ -42,7 +42,7 @@ class GlbFormat(Format):
     uses = ("tolerance", "shapes", "key_tolerance", "surface")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write one animation: all of it, by its own weights where it has some, or what the given shapes can show."""
+        """Write one animation: all of it, by its own weights where it has some, or weights of the given shapes."""
         (animation,) = animations
         space = FileSpace.of(animation, options, "m")
         head, animation = animation.head, animation.still()
@@ -51,8 +51,8 @@ class GlbFormat(Format):
         if options.shapes is not None:
             morphs, fit = named_shapes(animation, space, Path(options.shapes), options.key_tolerance)
             extras |= fit
-        elif (own := weighted_shapes(animation, space, options.tolerance / 1000)) is not None:
-            rest, morphs = own
+        elif (weighted := weighted_shapes(animation, space, options.tolerance / 1000)) is not None:
+            rest, morphs = weighted
             extras["tolerance_mm"] = options.tolerance
         else:
             offsets = np.stack([frame - rest for frame in space.frames(animation)])
@@ -120,7 +120,7 @@ def weighted_shapes(animation: Animation, space: FileSpace, tolerance: float) ->
     # A person's resting values need not be 0: the template is not always the face of weights 0.
     if np.abs(rest - space.place(animation.template)).max() < ROUNDING * np.ptp(rest):
         rest = space.place(animation.template)
-    if any(np.square(other - rest).sum(-1).max() > tolerance**2 for other in moved):
+    if any(np.square(pose - rest).sum(-1).max() > tolerance**2 for pose in moved):
         return None
     return rest, Morphs(shapes, weights, None, names)
 
@@ -242,8 +242,8 @@ def make_document(
     else:
         # A vertex of glTF has one texture coordinate: at a seam it becomes several.
         pairs = np.stack([faces, surface.turned(animation.triangles, faces)], axis=-1).reshape(-1, 2)
-        unique, places = np.unique(pairs, axis=0, return_inverse=True)
-        split, corners = unique[:, 0], places.reshape(-1, 3).astype(np.int32)
+        unique, row_of_corner = np.unique(pairs, axis=0, return_inverse=True)
+        split, corners = unique[:, 0], row_of_corner.reshape(-1, 3).astype(np.int32)
         coordinates = (surface.uvs * [1, -1] + [0, 1])[unique[:, 1]].astype(np.float32)  # v downwards
 
     def add_vertices(positions: Array, normals: Array) -> dict[str, int]:
@@ -338,12 +338,12 @@ class MovingNode:
     Attributes:
         name: ``head``, ``left_eye`` or ``right_eye``.
         curves: (T, n) values by the path that they change, ``rotation`` x, y, z, w and ``translation`` in metres.
-        place: (3,) where it is; None at the origin.
+        translation: (3,) its position; None at the origin.
     """
 
     name: str
     curves: Mapping[str, Array]
-    place: Array | None = None
+    translation: Array | None = None
 
 
 def moving_nodes(animation: Animation, space: FileSpace, head: npt.NDArray[np.float64] | None) -> list[MovingNode]:
@@ -369,9 +369,9 @@ def moving_nodes(animation: Animation, space: FileSpace, head: npt.NDArray[np.fl
     eyes = puppet_eyes(animation.template * metres_per_unit(animation.unit), animation.faces)
     for turn in turning:
         ball = None if eyes is None else eyes.eyeballs[turn.joint == "right_eye"]
-        place = None if ball is None else (animation.template[ball].mean(0) * space.factor).astype(np.float32)
+        translation = None if ball is None else (animation.template[ball].mean(0) * space.factor).astype(np.float32)
         turns = gltf_rotations(convert(animation.values[:, list(turn.channels)], turn.form, "quaternion"))
-        nodes.append(MovingNode(turn.joint, {"rotation": turns}, place))
+        nodes.append(MovingNode(turn.joint, {"rotation": turns}, translation))
     return nodes
 
 
@@ -389,8 +389,8 @@ def add_nodes(document: GlbWriter, frame_rate: float, added: Sequence[MovingNode
     times: int | None = None  # of all curves
     for moving in added:
         node: dict[str, Any] = {"name": moving.name}
-        if moving.place is not None:
-            node["translation"] = moving.place.tolist()
+        if moving.translation is not None:
+            node["translation"] = moving.translation.tolist()
         nodes.append(node)
         if moving.name == "head":
             node["children"] = siblings

@@ -68,8 +68,8 @@ def parts_of(glb: Glb, animation: Animation) -> tuple[list[Placed], Animation]:
             f"animation was carried to"
         )
     rest = np.asarray(animation.template, np.float64)
-    shown = np.concatenate([part.points for part in parts])
-    is_upright = np.linalg.norm(shown - rest @ Z_UP.T) < np.linalg.norm(shown - rest)  # of a file that has z up
+    points = np.concatenate([part.points for part in parts])
+    is_upright = np.linalg.norm(points - rest @ Z_UP.T) < np.linalg.norm(points - rest)  # of a file that has z up
     return parts, turned(animation, Z_UP) if is_upright else animation
 
 
@@ -86,24 +86,24 @@ def _animate(glb: Glb, writer: GlbWriter, parts: list[Placed], animation: Animat
     ]
     if not moving:
         return
-    used = np.concatenate([some for _, some in moving])
-    offsets = np.stack([np.asarray(frame, np.float64)[used] - rest[used] for frame in animation.frames()])
+    moving_rows = np.concatenate([some for _, some in moving])
+    offsets = np.stack([np.asarray(frame, np.float64)[moving_rows] - rest[moving_rows] for frame in animation.frames()])
     morphs = compress(offsets.astype(np.float32), tolerance)
     turns = _Turns(
-        rest, np.concatenate([part.faces + k for part, k in zip(parts, begins, strict=False)]), used, offsets
+        rest, np.concatenate([part.faces + k for part, k in zip(parts, begins, strict=False)]), moving_rows, offsets
     )
     times = writer.add((np.arange(len(offsets)) / animation.frame_rate).astype(np.float32), bounds=True)
-    own: dict[str, Any] = {"name": animation.name, "samplers": [], "channels": []}
+    motion: dict[str, Any] = {"name": animation.name, "samplers": [], "channels": []}
     by_node: dict[int, list[tuple[Placed, npt.NDArray[np.int64]]]] = defaultdict(list)
     for part, some in moving:
         by_node[part.node].append((part, some))
-    shown = [entry.get("mesh") for entry in glb.entries("nodes")]
+    drawn_rows = [entry.get("mesh") for entry in glb.entries("nodes")]
     for node, own_parts in sorted(by_node.items()):
         entry, mesh = glb.entry("nodes", node), own_parts[0][0].mesh
-        if shown.count(mesh) > 1:  # the other nodes keep theirs
+        if drawn_rows.count(mesh) > 1:  # the other nodes keep theirs
             original = glb.primitives(mesh)
             glb.content["meshes"].append(copy.deepcopy(glb.entry("meshes", mesh)))
-            entry["mesh"] = shown[node] = len(glb.content["meshes"]) - 1
+            entry["mesh"] = drawn_rows[node] = len(glb.content["meshes"]) - 1
             primitives = [
                 next(
                     new for old, new in zip(original, glb.primitives(entry["mesh"]), strict=True) if old is p.primitive
@@ -113,7 +113,9 @@ def _animate(glb: Glb, writer: GlbWriter, parts: list[Placed], animation: Animat
         else:
             primitives = [part.primitive for part, _ in own_parts]
         targets = {
-            id(primitive): _targets(glb, writer, part, primitive, morphs, np.searchsorted(used, some), turns, offsets)
+            id(primitive): _targets(
+                glb, writer, part, primitive, morphs, np.searchsorted(moving_rows, some), turns, offsets
+            )
             for primitive, (part, some) in zip(primitives, own_parts, strict=True)
         }
         default, before = _append(glb, writer, node, targets, len(morphs.shapes))
@@ -121,9 +123,9 @@ def _animate(glb: Glb, writer: GlbWriter, parts: list[Placed], animation: Animat
         rows = np.concatenate(
             [np.tile(np.array(default, np.float32), (len(offsets), 1)), morphs.weights], axis=1, dtype=np.float32
         )
-        own["samplers"].append({"input": times, "output": writer.add(rows.ravel()), "interpolation": "LINEAR"})
-        own["channels"].append({"sampler": len(own["samplers"]) - 1, "target": {"node": node, "path": "weights"}})
-    glb.put_first(own)
+        motion["samplers"].append({"input": times, "output": writer.add(rows.ravel()), "interpolation": "LINEAR"})
+        motion["channels"].append({"sampler": len(motion["samplers"]) - 1, "target": {"node": node, "path": "weights"}})
+    glb.put_first(motion)
 
 
 def _append(
@@ -162,13 +164,18 @@ def _targets(
     offsets: Array,
 ) -> list[dict[str, int]]:
     """Accessors of the new targets of a primitive, whose vertices are some rows of those that move."""
-    places = part.returned(np.asarray(morphs.shapes[:, rows], np.float64)).astype(np.float32)
-    targets = [{"POSITION": writer.add(place, target=ARRAY_BUFFER, bounds=True)} for place in places]
+    shape_offsets = part.returned(np.asarray(morphs.shapes[:, rows], np.float64)).astype(np.float32)
+    targets = [
+        {"POSITION": writer.add(offsets_of_target, target=ARRAY_BUFFER, bounds=True)}
+        for offsets_of_target in shape_offsets
+    ]
     accessor = attributes(primitive).get("NORMAL")
     if accessor is not None:
         local = glb.numbers(accessor, "VEC3", ("f4", "i1", "i2"), len(part.local)).astype(np.float64)
-        shown = _unit((local[:, None] @ np.linalg.inv(part.turn))[:, 0])  # normals turn by the inverse transpose
-        local_turns = (_unit((turns.at(offset, rows, shown)[:, None] @ part.turn)[:, 0]) for offset in offsets)
+        world_normals = _unit(
+            (local[:, None] @ np.linalg.inv(part.turn))[:, 0]
+        )  # normals turn by the inverse transpose
+        local_turns = (_unit((turns.at(offset, rows, world_normals)[:, None] @ part.turn)[:, 0]) for offset in offsets)
         normals = (normal.astype(np.float32) for normal in local_turns)
         shapes = normal_shapes(morphs.weights, local.astype(np.float32), normals)
         for target, shape in zip(targets, shapes, strict=True):
@@ -182,24 +189,26 @@ class _Turns:
     The file's own normals, which may be sharp at some edges and smooth at others, are turned and not replaced.
     """
 
-    def __init__(self, rest: Array, faces: npt.NDArray[np.int64], used: npt.NDArray[np.int64], offsets: Array) -> None:
+    def __init__(
+        self, rest: Array, faces: npt.NDArray[np.int64], moving: npt.NDArray[np.int64], offsets: Array
+    ) -> None:
         size = max(float(np.ptp(rest, axis=0).max()), np.finfo(float).tiny)
         self.rest = rest
         # Lips that touch at rest are in one place too, and part: a sum of all frames tells them from a seam.
         moved = np.zeros_like(rest)
-        moved[used] = np.tensordot(np.random.default_rng(0).normal(size=len(offsets)), offsets, axes=1)
-        places = np.rint(np.concatenate([rest, moved], axis=1) / (WELD * size))
-        first, place = np.unique(places, axis=0, return_index=True, return_inverse=True)[1:]
-        welded = place.reshape(-1)  # NumPy 2.0 returns it with a second axis
+        moved[moving] = np.tensordot(np.random.default_rng(0).normal(size=len(offsets)), offsets, axes=1)
+        positions = np.rint(np.concatenate([rest, moved], axis=1) / (WELD * size))
+        first, group = np.unique(positions, axis=0, return_index=True, return_inverse=True)[1:]
+        welded = group.reshape(-1)  # NumPy 2.0 returns it with a second axis
         near = np.zeros(len(rest), bool)
-        near[used] = True
+        near[moving] = True
         corners = welded[faces[near[faces].any(axis=1)]]
-        self.names = np.unique(np.concatenate([corners.ravel(), welded[used]]))
+        self.names = np.unique(np.concatenate([corners.ravel(), welded[moving]]))
         self.points = first[self.names]
         self.corners = np.searchsorted(self.names, corners)
-        self.place = np.searchsorted(self.names, welded[used])
+        self.place = np.searchsorted(self.names, welded[moving])
         self.moved = np.full(len(rest), -1)
-        self.moved[used] = np.arange(len(used))
+        self.moved[moving] = np.arange(len(moving))
         self.before = self._normals(rest[self.points])
 
     def _normals(self, points: Array) -> Array:
@@ -240,7 +249,7 @@ def _pad_others(glb: Glb, writer: GlbWriter, node: int, before: int, more: int) 
                 values = glb.numbers(sampler["output"], "SCALAR", ("f4", "i1", "u1", "i2", "u2")).reshape(-1, before)
                 padded = np.pad(values.astype(np.float32), ((0, 0), (0, more)))
                 sampler["output"] = writer.add(padded.ravel())
-                if sum(other.get("sampler") == number for other in channels) == 1:
+                if sum(entry.get("sampler") == number for entry in channels) == 1:
                     samplers[number] = sampler
                 else:
                     samplers.append(sampler)

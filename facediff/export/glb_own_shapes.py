@@ -112,12 +112,10 @@ def own_shapes(target: Path) -> OwnShapes:
 def unused_shapes(target: Path) -> list[str]:
     """A sentence for users if the avatar has shapes that the option would drive; else none."""
     try:
-        own = own_shapes(target)
+        avatar = own_shapes(target)
     except FaceDiffError:
         return []
-    return [
-        f"{target.name} has {len(own.binds)} shapes of its own ({own.kind}); --own-shapes drives them and adds none"
-    ]
+    return [f"{target.name} has {len(avatar.binds)} own shapes ({avatar.kind}); --own-shapes drives them and adds none"]
 
 
 def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
@@ -159,15 +157,15 @@ def _own_shapes(glb: Glb) -> OwnShapes:
     vrm: dict[str, list[ShapeBinding]] = defaultdict(list)
     lids: dict[str, list[ShapeBinding]] = defaultdict(list)
     for mesh, index, name in targets:
-        bind, short = ShapeBinding(mesh, index), re.split(r"[_.:| ]", name)[-1]
+        bind, suffix = ShapeBinding(mesh, index), re.split(r"[_.:| ]", name)[-1]
         if (shape := arkit_name(name)) is not None:
             arkit[shape].append(bind)
-        elif re.search(r"(?i)viseme|v_", name) or short in OCULUS:
-            viseme = next((n for n in OCULUS if n.lower() == RENAMED.get(short.lower(), short.lower())), None)
+        elif re.search(r"(?i)viseme|v_", name) or suffix in OCULUS:
+            viseme = next((n for n in OCULUS if n.lower() == RENAMED.get(suffix.lower(), suffix.lower())), None)
             if viseme is not None:
                 oculus[viseme].append(bind)
-        elif short.lower() in VOWELS and (len(name) == len(short) or re.search(r"(?i)mth|mouth|vowel", name)):
-            vrm[VOWELS[short.lower()]].append(bind)
+        elif suffix.lower() in VOWELS and (len(name) == len(suffix) or re.search(r"(?i)mth|mouth|vowel", name)):
+            vrm[VOWELS[suffix.lower()]].append(bind)
         for side, spellings in LIDS.items():
             if plain(name) in spellings:
                 lids[f"eyeBlink{side}" if side else BLINK].append(bind)
@@ -241,37 +239,37 @@ def _bones(glb: Glb) -> dict[str, int]:
     return result
 
 
-def _solved(glb: Glb, own: OwnShapes, animation: Animation) -> Weights:
+def _solved(glb: Glb, avatar: OwnShapes, animation: Animation) -> Weights:
     """Weights of the avatar's own shapes that come nearest to an animation of its mesh."""
     parts, animation = parts_of(glb, animation)
     total = len(animation.template)
-    deltas, first = np.zeros((len(own.binds), total, 3)), 0
+    deltas, first = np.zeros((len(avatar.binds), total, 3)), 0
     for part in parts:
         targets = glb.entries("targets", part.primitive)
-        for k, binds in enumerate(own.binds.values()):
+        for k, binds in enumerate(avatar.binds.values()):
             for bind in binds:
                 if bind.mesh == part.mesh and "POSITION" in (target := targets[bind.target] if targets else {}):
                     moves = glb.numbers(target["POSITION"], "VEC3", POSITIONS, len(part.local)).astype(np.float64)
                     deltas[k, first : first + len(part.local)] += bind.share * part.turned(moves)
         first += len(part.local)
-    shapes = ShapeSet(tuple(own.binds), np.asarray(animation.template, np.float64), deltas)
+    shapes = ShapeSet(tuple(avatar.binds), np.asarray(animation.template, np.float64), deltas)
     return solve(animation, shapes, SolveOptions(residual_limit=1.0))
 
 
-def _for_avatar(own: OwnShapes, weights: Weights) -> dict[str, Array]:
+def _for_avatar(avatar: OwnShapes, weights: Weights) -> dict[str, Array]:
     """Weights (T,) of the avatar's shapes, by their names."""
     tracks = dict(zip(weights.names, weights.values.T, strict=True))
-    if own.kind != "ARKit" and not any(name in tracks for name in own.binds if name in (*OCULUS, *VRM)):
-        visemes = weights.tracks("oculus" if own.kind == "Oculus" else "vrm")
+    if avatar.kind != "ARKit" and not any(name in tracks for name in avatar.binds if name in (*OCULUS, *VRM)):
+        visemes = weights.tracks("oculus" if avatar.kind == "Oculus" else "vrm")
         tracks |= dict(zip(visemes.names, visemes.values.T, strict=True))
     lids = [tracks[name] for name in ("eyeBlinkLeft", "eyeBlinkRight") if name in tracks]
     if BLINK not in tracks and lids:
         tracks[BLINK] = np.mean(lids, axis=0)
-    return {name: np.clip(tracks[name], 0.0, 1.0) for name in own.binds if name in tracks}
+    return {name: np.clip(tracks[name], 0.0, 1.0) for name in avatar.binds if name in tracks}
 
 
 def _animate(
-    glb: Glb, writer: GlbWriter, own: OwnShapes, tracks: dict[str, Array], weights: Weights, name: str
+    glb: Glb, writer: GlbWriter, avatar: OwnShapes, tracks: dict[str, Array], weights: Weights, name: str
 ) -> None:
     frames = len(weights.values)
     times = writer.add((np.arange(frames) / weights.frame_rate).astype(np.float32), bounds=True)
@@ -288,7 +286,7 @@ def _animate(
 
     by_mesh: dict[int, list[tuple[str, ShapeBinding]]] = defaultdict(list)
     for shape in tracks:
-        for bind in own.binds[shape]:
+        for bind in avatar.binds[shape]:
             by_mesh[bind.mesh].append((shape, bind))
     for node, entry in enumerate(glb.entries("nodes")):
         if entry.get("mesh") not in by_mesh:
@@ -301,31 +299,31 @@ def _animate(
         for shape, bind in binds:
             rows[:, bind.target] += bind.share * tracks[shape]
         add(node, "weights", np.clip(rows, 0.0, 1.0).astype(np.float32))
-    for node, turns in _turns(own, weights, _looks_back(glb)):
+    for node, turns in _turns(avatar, weights, _looks_back(glb)):
         add(node, "rotation", _local(glb, node, turns))
     if motion["channels"]:
         glb.put_first(motion)
 
 
-def _turns(own: OwnShapes, weights: Weights, looks_back: bool) -> list[tuple[int, Array]]:
+def _turns(avatar: OwnShapes, weights: Weights, looks_back: bool) -> list[tuple[int, Array]]:
     """Nodes and the quaternions (T, 4) by which they turn about the scene's axes."""
     none = np.zeros(len(weights.values))
     round_about = np.array([1.0, *ROUND_ABOUT]) if looks_back else np.ones(4)
     result = []
     for bone in ("head", "neck"):
-        if bone in own.bones and weights.head is not None:
-            result.append((own.bones[bone], convert(weights.head, "axis_angle", "quaternion")))
+        if bone in avatar.bones and weights.head is not None:
+            result.append((avatar.bones[bone], convert(weights.head, "axis_angle", "quaternion")))
     eyes = weights.eyes
     if eyes is None and any(name.startswith("eyeLook") for name in weights.names):
         eyes = gaze(weights.names, weights.values)
     for k, bone in enumerate(("left_eye", "right_eye")):
-        if bone in own.bones and eyes is not None:
+        if bone in avatar.bones and eyes is not None:
             turns = convert(eyes[:, 3 * k : 3 * k + 3], "euler", "quaternion")
-            result.append((own.bones[bone], round_about * turns))
-    if "jaw" in own.bones and "jawOpen" in weights.names:
+            result.append((avatar.bones[bone], round_about * turns))
+    if "jaw" in avatar.bones and "jawOpen" in weights.names:
         opening = JAW * weights.values[:, weights.names.index("jawOpen")]
         turns = convert(np.stack([opening, none, none], 1), "axis_angle", "quaternion")
-        result.append((own.bones["jaw"], round_about * turns))
+        result.append((avatar.bones["jaw"], round_about * turns))
     return result
 
 
@@ -334,13 +332,13 @@ def _local(glb: Glb, node: int, turns: Array) -> npt.NDArray[np.float32]:
     nodes, placed = glb.entries("nodes"), placed_nodes(glb)
     parent = next((index for index, entry in enumerate(nodes) if node in entry.get("children", [])), None)
     above = None if parent is None else placed[parent]
-    own = node_matrix(nodes[node])
-    frame, rest = (np.eye(3) if matrix is None else _rotation(matrix[:3, :3]) for matrix in (above, own))
+    rest = node_matrix(nodes[node])
+    frame, rest = (np.eye(3) if matrix is None else _rotation(matrix[:3, :3]) for matrix in (above, rest))
     if "matrix" in nodes[node]:  # which a node must not have where its rotation is animated
-        assert own is not None  # noqa: S101 - for type checkers
+        assert rest is not None  # noqa: S101 - for type checkers
         del nodes[node]["matrix"]
-        scale = np.linalg.norm(own[:3, :3], axis=0)
-        nodes[node] |= {"translation": own[:3, 3].tolist(), "scale": scale.tolist(), "rotation": _quaternion(rest)}
+        scale = np.linalg.norm(rest[:3, :3], axis=0)
+        nodes[node] |= {"translation": rest[:3, 3].tolist(), "scale": scale.tolist(), "rotation": _quaternion(rest)}
     local = frame.T @ matrices(turns) @ frame @ rest
     quaternions = convert(np.concatenate([local[..., 0], local[..., 1]], axis=-1), "six_d", "quaternion")
     return gltf_rotations(quaternions)

@@ -22,7 +22,7 @@ import bpy  # type: ignore[import-not-found]  # Blender runs this file
 def thin(curve: bpy.types.FCurve, tolerance: float) -> None:
     """Keep the keys of a curve between which no key is further than the tolerance from the straight line."""
     points = [(key.co[0], key.co[1]) for key in curve.keyframe_points]
-    kept, spans = {0, len(points) - 1}, [(0, len(points) - 1)]
+    keys, spans = {0, len(points) - 1}, [(0, len(points) - 1)]
     while spans:
         first, last = spans.pop()
         (t0, v0), (t1, v1) = points[first], points[last]
@@ -31,10 +31,10 @@ def thin(curve: bpy.types.FCurve, tolerance: float) -> None:
             for index, (t, v) in enumerate(points[first + 1 : last], first + 1)
         ]
         if apart and max(apart)[0] > tolerance:
-            kept.add(max(apart)[1])
+            keys.add(max(apart)[1])
             spans += [(first, max(apart)[1]), (max(apart)[1], last)]
     for index in reversed(range(len(points))):
-        if index not in kept:
+        if index not in keys:
             curve.keyframe_points.remove(curve.keyframe_points[index], fast=True)
     curve.update()
     for key in curve.keyframe_points:
@@ -104,7 +104,7 @@ def convert(glb: str, fbx: str, tolerance: float, rate: float, frames: int, blen
 
 
 if __name__ == "__main__":
-    own = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("glb")
     parser.add_argument("fbx")
@@ -112,7 +112,7 @@ if __name__ == "__main__":
     parser.add_argument("--frame-rate", type=float)
     parser.add_argument("--frames", type=int)
     parser.add_argument("--blend")
-    options = parser.parse_args(own)
-    given = options.frame_rate, options.frames
-    rate, frames = facts_of(options.glb) if None in given else given
+    options = parser.parse_args(arguments)
+    stated = options.frame_rate, options.frames
+    rate, frames = facts_of(options.glb) if None in stated else stated
     convert(options.glb, options.fbx, options.key_tolerance, rate, frames, options.blend)

@@ -110,7 +110,7 @@ def _draw(
 ) -> None:
     """Draw faces of one unit next to each other at one scale; the points in ``focus`` are in view, all if None."""
     camera = Camera.framing(focus or [panel.vertices for panel in panels])
-    drawn = [
+    pictures = [
         Renderer(
             panel.faces,
             template=panel.vertices,
@@ -120,4 +120,4 @@ def _draw(
         ).render(panel.vertices)
         for panel in panels
     ]
-    save_image(path, contact_sheet(drawn, columns or len(drawn), labels=[panel.label for panel in panels]))
+    save_image(path, contact_sheet(pictures, columns or len(pictures), labels=[panel.label for panel in panels]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -47,11 +48,11 @@ class MeshSequence(Format):
         """The frames' textures; files that they share are written to the folder."""
         return None
 
+    @abstractmethod
     def encoder(
         self, animation: Animation, space: FileSpace, surface: Textures | None = None
     ) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A function that gives a file's bytes from a frame's positions (V, 3)."""
-        raise NotImplementedError
 
 
 @export_format.register("obj")
@@ -170,9 +171,9 @@ class PointCache(Format):
                 form.write_materials(surface, path.parent, path.stem, path.stem)
             mesh.write_bytes(form.encoder(animation, space, surface, path.stem)(space.place(animation.template)))
 
+    @abstractmethod
     def header(self, animation: Animation) -> bytes:
         """The bytes before the positions."""
-        raise NotImplementedError
 
     def companions(self, path: Path, animation: Animation) -> list[Path]:
         """The mesh at rest."""

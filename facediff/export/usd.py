@@ -118,14 +118,14 @@ def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surfa
     st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(coordinates)))
     pictures = pictures_of(surface, file.stem)
-    for number, own in enumerate(surface.materials):
-        name = f"{Tf.MakeValidIdentifier(own.name)}_{number}"
+    for number, entry in enumerate(surface.materials):
+        name = f"{Tf.MakeValidIdentifier(entry.name)}_{number}"
         material = UsdShade.Material.Define(stage, root.AppendChild(name))
         look = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("surface"))
         look.CreateIdAttr("UsdPreviewSurface")
         look.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.7)
         colour = look.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-        colour.Set(Gf.Vec3f(*(float(part) for part in to_linear(own.colour))))
+        colour.Set(Gf.Vec3f(*(float(part) for part in to_linear(entry.colour))))
         if number in pictures:
             picture, data = pictures[number]
             file.with_name(picture).write_bytes(data)
@@ -142,16 +142,16 @@ def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surfa
             colour.ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
         material.CreateSurfaceOutput().ConnectToSource(look.CreateOutput("surface", Sdf.ValueTypeNames.Token))
         if len(surface.materials) == 1:
-            shown = mesh.GetPrim()
+            prim = mesh.GetPrim()
         else:
-            shown = UsdGeom.Subset.CreateGeomSubset(
+            prim = UsdGeom.Subset.CreateGeomSubset(
                 mesh,
                 name,
                 UsdGeom.Tokens.face,
                 Vt.IntArray.FromNumpy(np.flatnonzero(surface.of_face == number).astype(np.int32)),
                 "materialBind",
             ).GetPrim()
-        UsdShade.MaterialBindingAPI.Apply(shown).Bind(material)
+        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
 
 def _colour_by_vertices(stage: Any, path: Any, mesh: Any) -> None:  # noqa: ANN401

@@ -61,7 +61,9 @@ def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Ite
         )
     camera = None
     if len({metres_per_unit(animation.unit) for animation in animations}) == 1:
-        camera = Camera.framing([portrait(each.template, each.regions) for each in animations], view=options.view)
+        camera = Camera.framing(
+            [portrait(animation.template, animation.regions) for animation in animations], view=options.view
+        )
     renderers = [
         Renderer(
             animation.triangles,

@@ -47,10 +47,10 @@ class Similarity:
         """The map from the target to the source."""
         return Similarity(self.rotation.T, -(self.rotation.T @ self.translation) / self.scale, 1.0 / self.scale)
 
-    def then(self, other: Similarity) -> Similarity:
+    def then(self, following: Similarity) -> Similarity:
         """This map followed by another one."""
-        translation = other.apply(self.translation)
-        return Similarity(other.rotation @ self.rotation, translation, other.scale * self.scale)
+        translation = following.apply(self.translation)
+        return Similarity(following.rotation @ self.rotation, translation, following.scale * self.scale)
 
 
 def align(
@@ -253,11 +253,6 @@ def remove_rigid_motion(
         out: where to write the result, floating point (T, V, 3); may be ``frames`` itself. A new array if None.
         chunk_bytes: how much to read into memory at a time.
     """
-    if frames.ndim != 3 or frames.shape[1:] != target.shape or frames.shape[-1] != 3:
-        raise FaceDiffError(
-            f"rigid motion: frames have shape {frames.shape} and the target {target.shape}; "
-            f"expected (frames, vertices, 3) and (vertices, 3)"
-        )
     if out is None:
         out = np.empty(frames.shape, frames.dtype if frames.dtype.kind == "f" else np.float64)
     every = np.arange(len(target)) if stable is None else np.asarray(stable)

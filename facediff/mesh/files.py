@@ -44,21 +44,20 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         [[0, 1, 2], [0, 2, 3]]
     """
     suffix = path.suffix.lower()
-    if suffix == ".fbx":
-        export = f"bpy.ops.export_scene.gltf(filepath='{path.stem}.glb')"
-        raise FaceDiffError(
-            f'{path}: .fbx is read by Blender; convert it with `blender --background --python-expr "import bpy; '
-            f"bpy.ops.wm.read_factory_settings(use_empty=True); bpy.ops.import_scene.fbx(filepath='{path.name}'); "
-            f'{export}"` and give {path.stem}.glb'
-        )
     if suffix not in SUFFIXES:
-        raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}")
+        conversion = (
+            f'`blender --background --python-expr "import bpy; bpy.ops.wm.read_factory_settings(use_empty=True); '
+            f"bpy.ops.import_scene.fbx(filepath='{path.name}'); "
+            f"bpy.ops.export_scene.gltf(filepath='{path.stem}.glb')\"`"
+        )
+        advice = f"; convert it with {conversion} and give {path.stem}.glb" if suffix == ".fbx" else ""
+        raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}{advice}")
     data = read_bytes(path, remedy="expected a mesh")
     with damaged(path, f"not a readable {suffix[1:].upper()} mesh, export it again"):
         mesh = READERS[suffix](data, path)
     if not len(mesh.vertices) or not (len(mesh.faces) or points_allowed):
-        missing = "triangles" if len(mesh.vertices) else "vertices"
-        raise FaceDiffError(f"{path}: holds no {missing}; expected a mesh with vertices and faces")
+        lacking = "triangles" if len(mesh.vertices) else "vertices"
+        raise FaceDiffError(f"{path}: holds no {lacking}; expected a mesh with vertices and faces")
     check_coordinates(mesh.vertices, f"{path}:")
     return mesh
 
@@ -88,7 +87,8 @@ def _read_obj(data: bytes, path: Path) -> Mesh:
 
 def _colours(shares: Array) -> npt.NDArray[np.uint8]:
     """Colours (V, 3) of a text file, from 0 to 1 or to 255."""
-    shares = np.nan_to_num(shares)
+    if not np.isfinite(shares).all():
+        raise ValueError("colours are not finite")
     if shares.max(initial=0) >= 2:  # some tools write bytes; a little above 1 is a rounding
         shares = shares / 255
     return np.rint(shares.clip(0, 1) * 255).astype(np.uint8)
@@ -259,14 +259,14 @@ def _ply_row(element: _Element, body: memoryview, at: int) -> tuple[list[Any], i
 
 def _ply_text(elements: list[_Element], cells: list[bytes]) -> dict[str, Columns]:
     columns: dict[str, Columns] = {}
-    words = iter(cells)
+    tokens = iter(cells)
     try:
         for element in elements:
             rows: Columns = {name: [] for name, _, _ in element.properties}
             for _ in range(element.count if rows else 0):
                 for name, kind, length in element.properties:
                     number = float if length is None or kind[1] == "f" else int
-                    values = [number(next(words)) for _ in range(1 if length is None else int(next(words)))]
+                    values = [number(next(tokens)) for _ in range(1 if length is None else int(next(tokens)))]
                     rows[name].append(values if length is not None else values[0])
             for name, kind, length in element.properties:
                 if length is None and kind[1] == "f":
@@ -275,7 +275,7 @@ def _ply_text(elements: list[_Element], cells: list[bytes]) -> dict[str, Columns
             columns[element.name] = rows if element.count else {}
     except StopIteration as error:
         raise ValueError("it is cut short: its rows are not all there") from error
-    if next(words, None) is not None:
+    if next(tokens, None) is not None:
         raise ValueError("it holds more numbers than its header declares")
     return columns
 

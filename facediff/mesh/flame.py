@@ -183,16 +183,18 @@ def _flame_arrays(content: Any, path: Path) -> FlameArrays:  # noqa: ANN401 - of
     template = _numbers(content, "v_template", path, (None, 3))
     count = len(template)
     weights = _numbers(content, "weights", path, (count, JOINTS))
-    # Eq. 2 leaves the share 1 − w of a vertex where it is: right only where the weights of all joints sum to 1.
-    if np.abs(weights.sum(axis=1) - 1).max() > 1e-3:
-        raise FaceDiffError(f"{path}: the weights of a vertex do not add up to 1; {HELP}")
     faces = _numbers(content, "f", path, (None, 3))
     parents = _numbers(content, "kintree_table", path, (2, JOINTS))[0].astype(np.int64)
     parents[0] = -1  # the files have 2³² − 1 there
     # A parent comes before its children, so that one pass over the joints places all of them.
     ordered = (parents[1:] >= 0).all() and (parents < np.arange(JOINTS)).all()
-    if not ordered or faces.min() < 0 or faces.max() >= count:
-        raise FaceDiffError(f"{path}: f or kintree_table name vertices or joints that do not exist; {HELP}")
+    # Eq. 2 leaves the share 1 − w of a vertex where it is: right only where the weights of all joints sum to 1.
+    complete = np.abs(weights.sum(axis=1) - 1).max() <= 1e-3
+    if not (ordered and complete) or faces.min() < 0 or faces.max() >= count:
+        raise FaceDiffError(
+            f"{path}: f or kintree_table name vertices or joints that do not exist, or weights of a vertex do not sum "
+            f"to 1; {HELP}"
+        )
     return FlameArrays(
         template=template,
         directions=_numbers(content, "shapedirs", path, (count, 3, SHAPES + EXPRESSIONS)),

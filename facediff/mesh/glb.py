@@ -95,16 +95,15 @@ class Glb:
             whole_number(accessor, "count"),
             WIDTHS[form],
         )
-        if kind is None or kind.str[1:] not in kinds or accessor.get("type") != form:
-            raise ValueError("holds positions or indices of an unknown type: export it without compression")
+        without_data = "bufferView" not in accessor and count is None
+        if kind is None or kind.str[1:] not in kinds or accessor.get("type") != form or without_data:
+            raise ValueError("holds positions or indices of an unknown type, or none: export it without compression")
         if count is not None and stated != count:
             raise ValueError(f"has a target of {stated} vertices where the mesh has {count}")
         if "bufferView" in accessor:
             values = self._slab(accessor, kind, stated, width)
-        elif count is not None:
-            values = np.zeros((count, width), kind)
         else:
-            raise ValueError("has a mesh without data, perhaps a compressed one: export it without compression")
+            values = np.zeros((stated, width), kind)
         if "sparse" in accessor:
             sparse = accessor["sparse"]
             changed, at = whole_number(sparse, "count"), sparse["indices"]

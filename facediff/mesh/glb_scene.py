@@ -187,10 +187,8 @@ def _stands(glb: Glb, index: int, nodes: dict[int, Array | None]) -> Array:
     if "inverseBindMatrices" not in skin:
         return placed
     binds = glb.numbers(skin["inverseBindMatrices"], "MAT4", ("f4",))
-    if len(binds) < len(joints):
-        raise ValueError("has a skin with fewer matrices than joints")
     # glTF stores matrices column by column.
-    return placed @ binds[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
+    return placed @ binds[: len(joints)].reshape(len(joints), 4, 4).transpose(0, 2, 1).astype(np.float64)
 
 
 def _skinned(glb: Glb, stands: Array, primitive: dict[str, Any], count: int) -> Array | None:

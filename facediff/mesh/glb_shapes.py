@@ -111,11 +111,8 @@ def _names(glb: Glb, mesh: int, primitive: dict[str, Any]) -> list[str]:
     for holder in holders if count else []:
         extras = holder.get("extras")
         names = extras.get("targetNames") if isinstance(extras, dict) else None
-        if isinstance(names, list) and len(names) == count and all(isinstance(name, str) for name in names):
-            if len(set(names)) < count:
-                double = next(name for name in names if names.count(name) > 1)
-                raise ValueError(f'has two targets "{double}" in one mesh; rename one of them and export it again')
-            return names
+        if isinstance(names, list) and len({str(name) for name in names}) == len(names) == count:
+            return list(map(str, names))
     if count:
-        raise ValueError(f"has {count} targets and other names for them; export it with targetNames")
+        raise ValueError(f"has {count} targets without as many different names; export it with targetNames")
     return []

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, OptionError, choices, damaged
+from facediff.errors import OptionError, choices, damaged
 from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.plain_files import read_bytes
@@ -53,10 +53,6 @@ def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     """
     parts = mesh_parts(path)
     part_names = list(dict.fromkeys(name for part in parts for name in part.names))
-    if not part_names:
-        raise OptionError.naming(
-            f"{path}: its parts have no names; expected a .glb or .obj with named parts, or no {{part}}"
-        )
     triangles = []
     for pattern in names:
         stars = pattern.replace("[", "[[]").replace("?", "[?]")  # other signs stand for themselves
@@ -65,7 +61,8 @@ def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
             if matching:
                 break
         else:
-            raise FaceDiffError(f'{path}: has no part "{pattern}"; {choices(pattern, part_names)}')
+            advice = choices(pattern, part_names) if part_names else "its parts have no names, so omit {part}"
+            raise OptionError.naming(f'{path}: has no part "{pattern}"; {advice}')
         triangles += [part.triangles for part in matching]
     return np.unique(np.concatenate(triangles))
 

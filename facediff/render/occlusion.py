@@ -32,32 +32,32 @@ def sky_seen(vertices: npt.NDArray[np.floating[Any]], faces: npt.NDArray[np.inte
     """
     points = np.asarray(vertices, np.float64)
     # Only what is drawn matters: a lost vertex must not set the scale.
-    shown = points[np.unique(faces)]
-    cell = max(float(np.ptp(shown, axis=0).max()) / CELLS, 1e-12)
+    drawn_points = points[np.unique(faces)]
+    cell = max(float(np.ptp(drawn_points, axis=0).max()) / CELLS, 1e-12)
     samples = _surface(points, faces, cell)
     normals = vertex_normals(points, np.asarray(faces, np.int32))
-    seen, sky = np.zeros(len(points)), np.zeros(len(points))
+    visible, sky = np.zeros(len(points)), np.zeros(len(points))
     width = int(2 * CELLS)  # enough for a diagonal of the box, seen from anywhere
-    middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+    middle = (drawn_points.min(axis=0) + drawn_points.max(axis=0)) / 2
     for axis in lines_of_sight(AXES):
         across = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
         across /= np.linalg.norm(across)
         frame = np.stack([across, np.cross(axis, across), axis], axis=1)
         u, v, depth = ((samples - middle) @ frame).T
-        places = _cells(u, v, cell, width)
-        own = (points - middle) @ frame
-        own_places = _cells(own[:, 0], own[:, 1], cell, width)
+        sample_cells = _cells(u, v, cell, width)
+        vertex_points = (points - middle) @ frame
+        vertex_cells = _cells(vertex_points[:, 0], vertex_points[:, 1], cell, width)
         for sign in (1.0, -1.0):
             nearest = np.full(width * width, -np.inf)
-            np.maximum.at(nearest, places, sign * depth)
+            np.maximum.at(nearest, sample_cells, sign * depth)
             cosine = sign * (normals @ axis)
             weight = np.where(cosine > 0.15, cosine, 0.0)
             # Within a cell a plane that is seen at an angle rises by its tangent.
             rise = np.sqrt(2.0) * cell * np.sqrt(1.0 - np.minimum(cosine**2, 1.0)) / np.maximum(cosine, 0.15)
-            open_sky = sign * own[:, 2] + rise + LIFT * cell >= nearest[own_places]
-            seen += weight * open_sky
+            open_sky = sign * vertex_points[:, 2] + rise + LIFT * cell >= nearest[vertex_cells]
+            visible += weight * open_sky
             sky += weight
-    share = np.where(sky > 0, seen / np.maximum(sky, 1e-12), 1.0)
+    share = np.where(sky > 0, visible / np.maximum(sky, 1e-12), 1.0)
     # The lines are few: the mean of the triangles round a vertex takes their stripes away.
     sums = VertexSums(np.asarray(faces, np.int32), len(points))
     around = sums(np.repeat(share[faces].mean(axis=1)[:, None], 3, axis=1))[:, 0] / sums.counts[:, 0]
@@ -98,11 +98,11 @@ def _surface(points: Float64, faces: npt.NDArray[np.integer[Any]], cell: float) 
     parts = np.minimum(np.ceil(longest / cell).astype(np.int64), 2 * CELLS)
     samples = []
     for count in np.unique(np.maximum(parts, 1)).tolist():
-        chosen = corners[np.maximum(parts, 1) == count]
+        triangles = corners[np.maximum(parts, 1) == count]
         # Corners are left out: a vertex does not hide itself, and an edge's end belongs to several triangles.
         first, second = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
         inside = first + second < count
         a, b = (first[inside] + 1 / 3) / count, (second[inside] + 1 / 3) / count
         shares = np.stack([1 - a - b, a, b], axis=1)
-        samples.append(np.einsum("sk,fkc->fsc", shares, chosen).reshape(-1, 3))
+        samples.append(np.einsum("sk,fkc->fsc", shares, triangles).reshape(-1, 3))
     return np.concatenate(samples)

@@ -277,8 +277,10 @@ def _text_mask(text: str, points: int, max_width: int) -> npt.NDArray[np.float32
 def _wide_font() -> str | None:
     """A font with the letters of many languages, of matplotlib or of the system; None if there is none."""
     library = importlib.util.find_spec("matplotlib")
-    own = [str(Path(library.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf")] if library and library.origin else []
-    for name in (*own, "DejaVuSans.ttf", "NotoSans-Regular.ttf", "Arial.ttf", "arial.ttf"):
+    bundled = (
+        [str(Path(library.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf")] if library and library.origin else []
+    )
+    for name in (*bundled, "DejaVuSans.ttf", "NotoSans-Regular.ttf", "Arial.ttf", "arial.ttf"):
         with suppress(OSError):
             _pillow("ImageFont").truetype(name, 12)
             return name

@@ -124,20 +124,20 @@ class Renderer:
 
     def twin(self) -> Renderer:
         """This renderer with buffers of its own: both may draw at the same time, each in its thread."""
-        other = copy.copy(self)
-        other._canvas = _Canvas(self.camera, self.height, self.width, self._canvas.supersample)
-        return other
+        renderer = copy.copy(self)
+        renderer._canvas = _Canvas(self.camera, self.height, self.width, self._canvas.supersample)
+        return renderer
 
     def _draw(self, points: Float64, colours: Float32 | None, occluded: Float32 | None, window: _Window) -> Picture:
         """The window's pixels: light the vertices, rasterise, darken what lies behind, put over the background."""
         canvas = self._canvas
         canvas.clear(window)
-        fine = self._fine_vertices(points, colours, occluded)
-        canvas.draw(fine[:, :3], self._lit(fine), self._refinement.faces)
+        refined = self._fine_vertices(points, colours, occluded)
+        canvas.draw(refined[:, :3], self._lit(refined), self._refinement.faces)
         if self._open:
             # Backs are drawn against the same depth buffer: they show only where one looks inside. It is dark there, so
             # that no facets are seen, and the mesh need not be fine.
-            vertices = fine[: self.n_vertices]
+            vertices = refined[: self.n_vertices]
             vertices[:, 3:5] *= -1  # the normal of the other side
             vertices[:, 5] *= INSIDE
             canvas.draw(vertices[:, :3], self._lit(vertices), self._backs)
@@ -194,8 +194,8 @@ class Renderer:
         behind = np.maximum(distances, 0, out=distances)
         behind *= coverage
         behind *= np.float32(DEPTH_STRENGTH / self.camera.radius)
-        kept = (1 / (1 + behind))[..., None]
-        return np.asarray((kept * (1 - self._tint) + self._tint if tinted else kept) * self._strongest, np.float32)
+        light = (1 / (1 + behind))[..., None]
+        return np.asarray((light * (1 - self._tint) + self._tint if tinted else light) * self._strongest, np.float32)
 
     def _to_bytes(self, picture: Float32) -> Picture:
         """Linear light to sRGB bytes; overwrites its input."""
@@ -508,5 +508,7 @@ class _Canvas:
         depth += coverage
         depth -= 1  # what the empty samples added
         depth /= np.maximum(coverage, np.float32(1e-3))
-        near, far = 1 / self.camera.near, 1 / self.camera.far
-        return np.asarray(1 / (np.float32(near) + depth * np.float32(far - near)), dtype=np.float32)
+        near_inverse, far_inverse = 1 / self.camera.near, 1 / self.camera.far
+        return np.asarray(
+            1 / (np.float32(near_inverse) + depth * np.float32(far_inverse - near_inverse)), dtype=np.float32
+        )

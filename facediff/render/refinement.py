@@ -90,8 +90,8 @@ def _split_long_edges(faces: Faces, points: Float32, longest: float, shortest: f
     pairs = np.column_stack([edges // n_vertices, edges % n_vertices]).astype(np.int32)
     difference = points[pairs[:, 0]] - points[pairs[:, 1]]
     length, turn = np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
-    long = (length * (1 + turn / SHARP) > longest) & (length > shortest)
-    numbers = np.where(long, n_vertices + np.cumsum(long) - 1, -1)
+    too_long = (length * (1 + turn / SHARP) > longest) & (length > shortest)
+    numbers = np.where(too_long, n_vertices + np.cumsum(too_long) - 1, -1)
     middles = numbers[which].reshape(faces.shape).astype(np.int32)
     count = (middles >= 0).sum(axis=1)
     parts = [faces[count == 0]]
@@ -107,4 +107,4 @@ def _split_long_edges(faces: Faces, points: Float32, longest: float, shortest: f
         parts += [np.column_stack([m, b, n]), np.column_stack([a, m, n]), np.column_stack([a, n, c])]
     (a, b, c), (m, n, o) = faces[count == 3].T, middles[count == 3].T
     parts += [np.column_stack(corners) for corners in ((a, m, o), (m, b, n), (o, n, c), (m, n, o))]
-    return np.concatenate(parts).astype(np.int32), pairs[long]
+    return np.concatenate(parts).astype(np.int32), pairs[too_long]

@@ -152,11 +152,11 @@ class _Encoder:
             # Sound of the same rate passes unchanged.
             self.resampler = av.AudioResampler(format="fltp", layout="mono", rate=out_rate)
 
-    def run(self, first: Frame, others: Iterator[Frame]) -> int:
+    def run(self, first: Frame, rest: Iterator[Frame]) -> int:
         """Encode all frames and all of the sound; returns the number of frames."""
         self.add_frame(first)
         count = 1
-        for frame in others:
+        for frame in rest:
             self.add_frame(frame)
             count += 1
             self.add_sound(int(count / self.rate * self.hertz))

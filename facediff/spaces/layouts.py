@@ -76,8 +76,8 @@ def parametric(kind: Kind, parts: Iterable[Part], *, version: str = "", identity
 def _arkit(names: tuple[str, ...], source: str) -> Layout:
     turns: dict[str, Joint] = {"HeadYaw": "head", "LeftEyeYaw": "left_eye", "RightEyeYaw": "right_eye"}
     rotations = tuple(Rotation(joint, names.index(name), "euler") for name, joint in turns.items() if name in names)
-    absent = tuple(name for name in ARKIT if name not in names)
-    space = Space("arkit", names, "arkit", rotations=rotations, valid_range=(0.0, 1.0), absent=absent)
+    lacking = tuple(name for name in ARKIT if name not in names)
+    space = Space("arkit", names, "arkit", rotations=rotations, valid_range=(0.0, 1.0), absent=lacking)
     return Layout(space, None, source=source)
 
 

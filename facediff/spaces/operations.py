@@ -59,12 +59,12 @@ def permuted(values: Values, source: Space, target: Space) -> tuple[Values, Spac
     for row, index in enumerate(columns):
         if index is not None:
             result[:, row] = values[:, index]
-    missing = {name.casefold() for name in source.absent}
-    missing |= {name.casefold() for name, index in zip(target.channels, columns, strict=True) if index is None}
-    absent = [name for name in target.channels if name.casefold() in missing]
-    absent += [name for name in target.absent if name not in target.channels]
+    unknown = {name.casefold() for name in source.absent}
+    unknown |= {name.casefold() for name, index in zip(target.channels, columns, strict=True) if index is None}
+    lacking = [name for name in target.channels if name.casefold() in unknown]
+    lacking += [name for name in target.absent if name not in target.channels]
     version = source.version or target.version
-    return result, replace(target, version=version, rig=source.rig, rig_hash=source.rig_hash, absent=tuple(absent))
+    return result, replace(target, version=version, rig=source.rig, rig_hash=source.rig_hash, absent=tuple(lacking))
 
 
 def truncated(values: Values, space: Space, counts: dict[str, int]) -> tuple[Values, Space]:

@@ -58,9 +58,8 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
     """
     if path.suffix.lower() == ".glb":
         return _read_glb(path, vertices)
-    if not path.is_dir():
-        raise FaceDiffError(f"{path}: no such folder; expected one of .obj or .ply files, or a .glb with named targets")
-    candidates = sorted(f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
+    files = path.iterdir() if path.is_dir() else []
+    candidates = sorted(f for f in files if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
     if any(plain(file.stem) == ICT_NEUTRAL for file in candidates):
         # Next to its expressions ICT-FaceKit keeps a hundred heads of other people.
         candidates = [file for file in candidates if not re.fullmatch(r"identity\d+", file.stem)]
@@ -68,8 +67,8 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
     shapes = [file for file in candidates if file not in rest]
     if len(rest) > 1 or not shapes:
         raise FaceDiffError(
-            f"{path}: holds {len(shapes)} shapes and {len(rest)} faces at rest ({', '.join(NEUTRAL[:3])} …); expected "
-            f".obj or .ply files named jawOpen, mouthFunnel … and at most one at rest"
+            f"{path}: {'' if path.is_dir() else 'no such folder; it '}holds {len(shapes)} shapes and {len(rest)} faces "
+            f"at rest; expected .obj or .ply files named jawOpen, mouthFunnel … and at most one neutral"
         )
     files = [*rest, *shapes]
     meshes = [read_mesh(file, points_allowed=True) for file in files]

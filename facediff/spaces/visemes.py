@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
 from facediff.spaces.arkit import ALPHABETICAL, LEFT_AND_RIGHT
 from facediff.spaces.layouts import layout
 from facediff.spaces.operations import permuted
@@ -88,8 +87,6 @@ def visemes(values: Values, space: Space, viseme_set: VisemeSet) -> tuple[Values
         >>> names.channels[int(weights[0].argmax())]
         'A'
     """
-    if viseme_set not in SETS:
-        raise FaceDiffError(f'visemes: there is no set "{viseme_set}"; {choices(viseme_set, SETS)}')
     weights = permuted(values, space, layout("arkit"))[0]
     shares = np.clip(weights @ viseme_map(viseme_set), 0.0, 1.0)
     if viseme_set == "oculus":

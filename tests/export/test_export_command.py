@@ -57,11 +57,3 @@ def test_what_a_file_says_of_its_own_rate_and_unit_stands(
     assert main(["export", str(source), "-o", str(out), option, wrong]) == 2
     assert f": in.npz has {own}" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_animations_of_one_recording_are_named_after_their_files(animation: Animation, tmp_path: Path) -> None:
-    for name in ("mine", "theirs"):
-        write_archive(tmp_path / f"{name}.npz", animation)
-    page = tmp_path / "page.html"
-    assert main(["export", str(tmp_path / "mine.npz"), str(tmp_path / "theirs.npz"), "-o", str(page)]) == 0
-    assert "<title>mine · theirs – facediff</title>" in page.read_text(encoding="utf-8")

@@ -207,12 +207,6 @@ def test_glb_of_more_vertices_than_short_indices_can_count(
     assert reader.primitive.attributes.COLOR_0 is None
 
 
-def test_glb_of_the_same_animation_has_the_same_bytes(animation: Animation, tmp_path: Path) -> None:
-    for folder in ("one", "two"):
-        write_animations(tmp_path / folder / "a.glb", [animation])
-    assert (tmp_path / "one" / "a.glb").read_bytes() == (tmp_path / "two" / "a.glb").read_bytes()
-
-
 @pytest.mark.parametrize("key_tolerance", [0.0, 0.05])
 def test_named_shapes_give_named_targets_and_curves(tmp_path: Path, key_tolerance: float) -> None:
     """Targets, their normals, and weights at the keys are those of the shapes' own face."""

@@ -42,15 +42,6 @@ def test_no_speech_is_a_silent_video(animation: Animation, tmp_path: Path) -> No
         assert not container.streams.audio
 
 
-def test_corpus_is_named_below_the_video(make_animation: Callable[..., Animation]) -> None:
-    def height(animation: Animation, footer: str = "") -> int:
-        return len(next(drawn_frames([animation], ExportOptions(size=64, footer=footer))))
-
-    bare = height(make_animation(metadata={}))
-    assert height(make_animation(metadata={"corpus": "puppet (synthetic)"})) > bare
-    assert height(make_animation(metadata={}), "synthetic corpus") > bare
-
-
 def test_several_animations_are_shown_side_by_side_and_wait_for_the_longest(
     make_animation: Callable[..., Animation], tmp_path: Path
 ) -> None:

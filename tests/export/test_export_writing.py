@@ -73,36 +73,6 @@ def test_export_is_refused_before_any_work(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("unit", ["m", "1", None])
-def test_export_accepts_the_unit_that_the_format_prescribes(tmp_path: Path, unit: str | None) -> None:
-    check_export(tmp_path / "a.glb", ExportOptions(output_unit=unit, up="y"))
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"vertices": "nan"}, "frame 3 holds NaN"),
-        ({"template": "nan"}, "its template of shape"),
-        ({"faces": None}, "comes without a mesh"),
-        ({"colours": np.zeros((7, 3), np.uint8)}, "colours of shape (7, 3)"),
-        ({"speech": np.full(9, np.nan, np.float32)}, "its speech holds NaN"),
-    ],
-)
-@pytest.mark.parametrize("suffix", [".glb", ".usdc", ".obj", ".ply"])
-def test_export_refuses_animations_that_would_make_broken_files(
-    make_animation: Callable[..., Animation], tmp_path: Path, change: dict[str, object], sentence: str, suffix: str
-) -> None:
-    for name in [name for name, value in change.items() if isinstance(value, str)]:
-        array = getattr(make_animation(), name).copy()
-        array[3 if name == "vertices" else 0] = np.nan
-        change = {name: array}
-    with pytest.raises(FaceDiffError) as caught:
-        write_animations(tmp_path / "new" / f"a{suffix}", [make_animation(), make_animation(**change)])
-    assert sentence in str(caught.value)
-    assert "Hello Zoë" in str(caught.value)
-    assert not list(tmp_path.iterdir())
-
-
 def test_export_of_several_animations_writes_a_file_each(
     make_animation: Callable[..., Animation], tmp_path: Path
 ) -> None:

@@ -100,18 +100,6 @@ def test_the_command_ends_and_refuses_what_has_no_effect(
     assert surface_notes(tmp_path / "target.obj", tmp_path / name, clicks()) == []
 
 
-def test_without_blender_the_script_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.setattr(fbx, "MODULE", "no_such_module")
-    write_archive(tmp_path / "a.npz", clicks())
-    assert main(["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / "a.fbx")]) == 2
-    assert str(fbx.SCRIPT) in capsys.readouterr().err
-    monkeypatch.setattr(fbx, "MODULE", "json")
-    assert fbx.command() == [sys.executable, str(fbx.SCRIPT)]
-
-
 def test_frame_rate_and_length_are_read_from_a_face_and_from_an_avatar(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -361,37 +360,3 @@ def test_a_figures_head_turns_by_its_bone_where_shapes_are_solved_for(
     jaw = rows[0][:, list(parts["Head"].targets).index("jawOpen")]
     assert np.abs(jaw - opening).max() < 0.15
     assert np.abs(rows[1] - rows[0]).max() < 1e-3
-
-
-def test_the_command_says_what_plays_and_what_has_no_effect(
-    tmp_path: Path, parts: dict[str, AvatarPart], spoken: Animation, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_avatar(tmp_path / "avatar.glb", parts)
-    write_archive(tmp_path / "talk.npz", spoken)
-    words = ["retarget", str(tmp_path / "talk.npz"), "--target-mesh", str(tmp_path / "avatar.glb"), "--own-shapes"]
-    assert main([*words, "-o", str(tmp_path / "out.glb")]) == 0
-    said = capsys.readouterr().out
-    assert "HeadJoint" in said
-    assert "left out" not in said
-    assert main([*words, "-o", str(tmp_path / "out.glb"), "--quiet"]) == 0
-    assert capsys.readouterr().out.split() == [str(tmp_path / "out.glb")]
-    for more, option in (
-        (["--correspondence", str(tmp_path / "a.npz")], "--correspondence"),
-        (["--bare-face"], "--bare-face"),
-        (["--add-to-mesh"], "--add-to-mesh"),
-    ):
-        assert main([*words, "-o", str(tmp_path / "b.glb"), *more]) == 2
-        assert option in capsys.readouterr().err
-    assert main([*words, "-o", str(tmp_path / "b.npz")]) == 2
-    glb = opened(tmp_path / "avatar.glb")
-    next(node for node in glb.content["nodes"] if node["name"] == "HeadJoint")["name"] = "Crown"
-    (tmp_path / "boneless.glb").write_bytes(pack(glb.content, glb.binary))
-    for head, lost in ((spoken.head, True), (None, False)):
-        still = replace(spoken, head=head).made_of(spoken.space, np.asarray(spoken.values))
-        write_archive(tmp_path / "talk.npz", still)
-        assert main([*words[:3], str(tmp_path / "boneless.glb"), words[4], "-o", str(tmp_path / "c.glb")]) == 0
-        assert ("head's motion is left out" in capsys.readouterr().out) == lost
-    write_avatar(tmp_path / "mute.glb", parts, names={name: f"x{k}" for k, name in enumerate(ALPHABETICAL)})
-    words[3] = str(tmp_path / "mute.glb")
-    assert main([*words, "-o", str(tmp_path / "b.glb")]) == 2
-    assert "jawOpen" in capsys.readouterr().err

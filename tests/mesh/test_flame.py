@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facediff.errors import FaceDiffError
-from facediff.mesh.flame import CHUNK, Flame, FlameArrays, plain_array, read_flame_arrays, rotations
+from facediff.mesh.flame import CHUNK, Flame, FlameArrays, read_flame_arrays, rotations
 from tests.fakes.flame import (
     chumpy_array,
     chumpy_reordered,
@@ -108,33 +108,6 @@ QUARTER = np.array([[np.pi / 2, 0, 0]])
 NOTHING = np.zeros((1, 0))
 
 
-def test_the_jaw_opened_by_a_right_angle_about_x() -> None:
-    """Relative to the joint (0, 1, 0), (0, 0, 2) becomes (0, −2, 0); in part, the point lies between the two."""
-    opened = layer(tiny_rig()).vertices(np.zeros(0), NOTHING, QUARTER)[0]
-    by_hand = [[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0.5, 1.5], [0, 1, 2], [5, 5, 5]]
-    np.testing.assert_allclose(opened, by_hand, atol=1e-12)
-
-
-def test_the_pose_correctives_of_the_jaw_are_added_before_the_turn() -> None:
-    """R − I has −1 at (1, 1), (1, 2), (2, 2) and 1 at (2, 1): entries 4, 5, 8 and 7 of the jaw's nine."""
-    correctives = np.zeros((6, 3, 36))
-    correctives[1, 0, 9 + 4] = 1  # −1 along x
-    correctives[1, 1, 9 + 7] = 10  # 10 along y, which the turn makes z
-    correctives[4, 2, 9 + 5] = 100  # −100 along z, at a vertex that does not turn
-    correctives[:, :, :9] = correctives[:, :, 18:] = 1e6  # of the joints that stay
-    opened = layer(tiny_rig(posedirs=correctives)).vertices(np.zeros(0), NOTHING, QUARTER)[0]
-    np.testing.assert_allclose(opened[1], [-1, -1, 10], atol=1e-12)
-    np.testing.assert_allclose(opened[4], [0, 1, -98], atol=1e-12)
-
-
-def test_shape_and_expression_move_the_joint() -> None:
-    """The first coefficient of each lifts everything by 3 and 4: the face opens as before, seven higher."""
-    directions = np.zeros((6, 3, 400))
-    directions[:, 1, 0], directions[:, 1, 300] = 3, 4
-    opened = layer(tiny_rig(shapedirs=directions)).vertices(np.ones(1), np.ones((1, 1)), QUARTER)[0]
-    np.testing.assert_allclose(opened[1], [0, 6, 0], atol=1e-12)
-
-
 def test_what_hangs_on_the_jaw_turns_with_it() -> None:
     content = tiny_rig(kintree_table=np.array([[2**32 - 1, 0, 1, 2, 3], [0, 1, 2, 3, 4]]))
     content["weights"][4] = [0, 0, 0, 0, 1]  # a joint whose parent's parent is the jaw
@@ -165,39 +138,6 @@ def test_a_long_clip_is_the_same_frame_by_frame() -> None:
     alone = [model.vertices(shape, expression[t : t + 1], jaw[t : t + 1])[0] for t in range(frames)]
     np.testing.assert_allclose(together, alone, atol=1e-14)
     assert model.vertices(shape, expression[:0], jaw[:0]).shape == (0, 16, 3)
-
-
-def test_zero_parameters_give_the_template_exactly() -> None:
-    content = flame_arrays()
-    model = layer(content)
-    np.testing.assert_array_equal(
-        model.vertices(np.zeros(300), np.zeros((2, 100)), np.zeros((2, 3)))[1], model.template
-    )
-    np.testing.assert_array_equal(model.template, content["v_template"])
-    np.testing.assert_array_equal(model.faces, content["f"])
-    assert model.n_vertices == 80
-
-
-def test_shape_and_expression_are_linear_at_rest() -> None:
-    model, still = layer(flame_arrays()), np.zeros((1, 3))
-    shape, other, expression = RNG.normal(size=300), RNG.normal(size=300), RNG.normal(size=(1, 100))
-
-    def offset(shape: np.ndarray, expression: np.ndarray) -> np.ndarray:
-        return model.vertices(shape, expression, still)[0] - model.template
-
-    both = offset(2 * shape - other, 3 * expression)
-    zero = np.zeros((1, 100))
-    separate = 2 * offset(shape, zero) - offset(other, zero) + 3 * offset(np.zeros(300), expression)
-    np.testing.assert_allclose(both, separate, atol=1e-14)
-    np.testing.assert_allclose(model.shaped(shape), model.vertices(shape, zero, still)[0], atol=1e-15)
-
-
-def test_coefficients_that_are_left_out_are_zero() -> None:
-    model = layer(flame_arrays())
-    shape, expression, jaw = np.zeros(300), np.zeros((4, 100)), RNG.normal(size=(4, 3))
-    shape[:7], expression[:, :50] = 1, 0.5
-    full = model.vertices(shape, expression, jaw)
-    np.testing.assert_allclose(model.vertices(shape[:7], expression[:, :50], jaw), full, atol=1e-15)
 
 
 @settings(deadline=None, max_examples=50)
@@ -334,8 +274,3 @@ def test_a_hostile_model_is_refused_and_does_not_run(protocol: int, tmp_path: Pa
     assert not mark.exists()
     pickle.loads(hostile)  # noqa: S301 - it would have run
     assert mark.exists()
-
-
-def test_plain_arrays_pass_as_they_are() -> None:
-    values = np.arange(3, dtype=np.uint32)
-    assert plain_array(values, "f") is values

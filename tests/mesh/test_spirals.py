@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError
 from facediff.mesh.spirals import spirals
 from tests.fakes.meshes import relief, sphere, together
 
@@ -73,8 +72,6 @@ def test_where_rings_end_the_nearest_follow() -> None:
         [4, 2, 0, 1, 5],
         [5, 0, 1, 2, 4],
     ]
-    with pytest.raises(FaceDiffError, match="give the template"):
-        spirals(np.array([[0, 1, 2]]), 6, 5)
 
 
 @pytest.mark.parametrize(("length", "dilation"), [(1, 1), (9, 1), (12, 1), (7, 3)])

@@ -6,7 +6,6 @@ import matplotlib
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError
 from facediff.render import Renderer, comparison
 from facediff.render.panels import heat_ramp
 
@@ -42,15 +41,3 @@ def test_comparison_shows_truth_prediction_and_coloured_prediction(renderer: Ren
 def test_the_ramp_is_cividis_throughout() -> None:
     expected = 255 * matplotlib.colormaps["cividis"](np.arange(256))[:, :3]
     assert np.abs(heat_ramp() - expected).max() < 12  # of 255, in the darkest blue, where cividis has a kink
-
-
-def test_comparison_refuses_motions_that_cannot_be_coloured(renderer: Renderer) -> None:
-    broken = OFF.copy()
-    broken[2, 0, 0] = np.nan
-    for truth, prediction, highest, message in (
-        (TRUTH, OFF[:1], 1.0, '"truth" 3, "facediff" 1'),
-        (TRUTH, broken, 1.0, "not finite"),
-        (TRUTH, OFF, 0.0, "no extent"),
-    ):
-        with pytest.raises(FaceDiffError, match=message):
-            comparison(renderer, truth, prediction, highest=highest, scale_label="")

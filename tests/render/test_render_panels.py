@@ -8,7 +8,6 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from facediff.errors import FaceDiffError
 from facediff.render import Renderer, contact_sheet, save_image, side_by_side
 from facediff.render.panels import _text_mask, _wide_font
 
@@ -50,11 +49,6 @@ def test_side_by_side_mixes_topologies_and_colours(renderer: Renderer, sphere: M
     frames = list(side_by_side([renderer, other], [MOTION, still], ["a", "b"], colours=[heat, None]))
     assert frames[0].shape[1] == 80 + 64
     np.testing.assert_array_equal(frames[1][-96:, :80], renderer.render(MOTION[1], colours=heat[1]))
-
-
-def test_side_by_side_refuses_motions_of_different_lengths(renderer: Renderer) -> None:
-    with pytest.raises(FaceDiffError, match='"a" 3, "b" 2'):
-        side_by_side(renderer, [MOTION, MOTION[:2]], ["a", "b"])
 
 
 def test_contact_sheet_places_pictures_row_by_row() -> None:

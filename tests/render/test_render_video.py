@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from facediff.errors import FaceDiffError
 from facediff.render import Renderer, write_video
 
 Frame = npt.NDArray[np.uint8]
@@ -172,27 +171,3 @@ def test_video_of_a_failing_generator_leaves_nothing(tmp_path: Path, error: Base
         write_video(tmp_path / "new" / "folder" / "a.mp4", failing(), 25, np.zeros(100000, np.float32), SAMPLE_RATE)
     assert caught.value is error
     assert list(tmp_path.iterdir()) == []
-
-
-def test_video_that_fails_keeps_the_old_one(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    path.write_bytes(b"before")
-    frames = [*_frames(5), np.zeros((10, 10, 3), np.uint8)]
-    with pytest.raises(ValueError, match="reshape"):
-        write_video(path, frames, 25)
-    assert path.read_bytes() == b"before"
-    assert list(tmp_path.iterdir()) == [path]
-    write_video(path, _frames(5), 25)
-    assert path.stat().st_size > 500
-
-
-def test_a_file_that_cannot_be_written_is_one_clear_sentence(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for name, count, message in (
-        ("a.avi", 2, "must end in .mp4"),
-        ("file/a.mp4", 2, r"a\.mp4: cannot be written"),
-        ("a.mp4", 0, "no frames"),
-    ):
-        with pytest.raises(FaceDiffError, match=message):
-            write_video(tmp_path / name, _frames(count), 25)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["file"]

@@ -60,8 +60,8 @@ def pack_motion(animation: Animation, blobs: Blobs) -> list[int]:
                 f"{animation.name}: moves {furthest * STEP / 1000:.3g} m away from its template; give the unit of "
                 f"length ({{unit}}) and the template ({{mesh}}) that belong to it"
             )
-        whole: npt.NDArray[np.int32] = steps.astype(np.int32)
-        differences = np.diff(whole, axis=0, prepend=np.zeros_like(whole[:1]))
+        steps_of_chunk: npt.NDArray[np.int32] = steps.astype(np.int32)
+        differences = np.diff(steps_of_chunk, axis=0, prepend=np.zeros_like(steps_of_chunk[:1]))
         # Modulo 2¹⁶: the sums of 16 bits that the page computes come out right, however far two frames are apart.
         differences = differences.astype(np.int16).astype(np.int32)
         folded = ((differences << 1) ^ (differences >> 31)).astype(np.uint16).transpose(2, 1, 0)
@@ -86,14 +86,14 @@ def bounds(animation: Animation) -> tuple[list[float], list[float]]:
     return ((low + high) / 2).round(3).tolist(), ((high - low) / 2).round(3).tolist()
 
 
-def heat_scale_end(truth: Animation, others: Sequence[Animation]) -> float:
+def heat_scale_end(truth: Animation, predictions: Sequence[Animation]) -> float:
     """Error in mm that gets a heat map's last colour: the worst 99th percentile, rounded up to one digit."""
     # 200 frames are enough for a percentile, and few enough for memory.
-    chosen = np.unique(np.linspace(0, len(truth.vertices) - 1, 200).astype(int))
-    right = np.asarray(truth.vertices[chosen], np.float64) * millimetres(truth)
+    sample = np.unique(np.linspace(0, len(truth.vertices) - 1, 200).astype(int))
+    right = np.asarray(truth.vertices[sample], np.float64) * millimetres(truth)
     largest = 0.1
-    for animation in others:
-        positions = np.asarray(animation.vertices[chosen], np.float64) * millimetres(animation)
+    for animation in predictions:
+        positions = np.asarray(animation.vertices[sample], np.float64) * millimetres(animation)
         largest = max(largest, float(np.quantile(np.linalg.norm(positions - right, axis=2), 0.99)))
     return round_up(largest)
 

@@ -65,12 +65,12 @@ class Picking:
     """Two meshes on which the same places are picked.
 
     Attributes:
-        source: the animation, whose mesh at rest is shown.
+        source: the animation; its mesh at rest is shown.
         target: the other mesh.
-        names: what the page calls both.
+        names: of both meshes on the page.
         file: where the places are saved.
-        start: what the page begins with; None for nothing.
-        shown: numbers of the target's triangles that the face is searched for in; None for all.
+        start: first landmarks of the page; None for none.
+        face_triangles: numbers of the target's triangles in which to search for the face; None for all.
         parts: of the target, which the page can hide.
     """
 
@@ -79,7 +79,7 @@ class Picking:
     names: tuple[str, str]
     file: Path
     start: Landmarks | None = None
-    shown: npt.NDArray[np.integer] | None = None
+    face_triangles: npt.NDArray[np.integer] | None = None
     parts: Sequence[MeshPart] = ()
 
     @property
@@ -88,7 +88,7 @@ class Picking:
         return len(self.source.template), len(self.target.vertices)
 
     def save(self, content: dict[str, Any]) -> int:
-        """Check what the page sends and write it; how many pairs there are."""
+        """Check and write the landmarks that the page sends; their number."""
         landmarks = parse_landmarks(content, "request", counts=self.counts)
         if len(landmarks) < FEWEST:
             raise FaceDiffError(f"request: holds {len(landmarks)} pairs; expected {FEWEST} or more")
@@ -102,15 +102,17 @@ def picking_page(picking: Picking) -> list[str]:
     rest: Array = np.asarray(source.template, np.float64)
     goal = Surface(rest, outward(source).astype(np.int64))
     moved = run_alike(goal, Surface(target.vertices, target.faces.astype(np.int64)))
-    shown = moved.faces if picking.shown is None else moved.faces[picking.shown]
-    back, features, seen = placed(goal, Surface(target.vertices, shown))
-    if features is not None and not _as_wide(features, seen):
+    faces = moved.faces if picking.face_triangles is None else moved.faces[picking.face_triangles]
+    back, features, target_features = placed(goal, Surface(target.vertices, faces))
+    if features is not None and not _as_wide(features, target_features):
         # No mouth is where the alignment expects it: a person knows best how the mesh lies in its file.
-        seen, back = None, _as_in_its_file(rest, target.vertices, shown)
+        target_features, back = None, _as_in_its_file(rest, target.vertices, faces)
     laid = back.apply(target.vertices)
     source_landmarks = known_landmarks(rest, goal.faces)
     of_target = known_topology(target.vertices)
-    suggested = landmarks_by_shape(laid, shown, seen) if seen is not None and of_target is None else {}
+    suggested = (
+        landmarks_by_shape(laid, faces, target_features) if target_features is not None and of_target is None else {}
+    )
     blobs = Blobs()
     animations = [
         Animation(
@@ -137,7 +139,10 @@ def picking_page(picking: Picking) -> list[str]:
         "sides": {
             side: _side(animation, side_features, blobs)
             for side, animation, side_features in zip(
-                ("source", "target"), animations, (features, features if seen is not None else None), strict=True
+                ("source", "target"),
+                animations,
+                (features, features if target_features is not None else None),
+                strict=True,
             )
         },
     }
@@ -165,8 +170,8 @@ def _runs(parts: Sequence[MeshPart]) -> list[tuple[str, list[tuple[int, int]]]]:
 ALIKE = 0.4, 2.5  # widths of the mouth of a mesh that is laid well, in the source's
 
 
-def _as_wide(features: Features, seen: Features | None) -> bool:
-    return seen is not None and ALIKE[0] < seen.mouth.width / features.mouth.width < ALIKE[1]
+def _as_wide(features: Features, target: Features | None) -> bool:
+    return target is not None and ALIKE[0] < target.mouth.width / features.mouth.width < ALIKE[1]
 
 
 def _as_in_its_file(rest: Array, points: Array, faces: npt.NDArray[np.integer]) -> Similarity:
@@ -178,8 +183,8 @@ def _as_in_its_file(rest: Array, points: Array, faces: npt.NDArray[np.integer]) 
 
 
 ABOUT = 1.5, 1.9, 0.55
-"""Half width and half height of what is shown of a face, and how far its middle lies above the mouth's; in widths of
-the mouth."""
+"""Half width and half height of the view of a face, and how far its middle lies above the mouth's; in widths of the
+mouth."""
 
 
 def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict[str, Any]:
@@ -210,10 +215,10 @@ def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict
 
 
 def make_app(picking: Picking, page: str, hosts: tuple[str, ...] | None, stop: Callable[[], None]) -> Starlette:
-    """The ASGI application: the page, and an address that takes what it sends.
+    """The ASGI application: the page, and an address for its landmarks.
 
     Args:
-        picking: what is picked, and where it is saved.
+        picking: the meshes and the file.
         page: its text.
         hosts: names under which the page is served; None for any.
         stop: called when the places are saved.
@@ -250,25 +255,25 @@ def pick_landmarks(
     *,
     names: tuple[str, str],
     start: Path | None = None,
-    shown: npt.NDArray[np.integer] | None = None,
+    face_triangles: npt.NDArray[np.integer] | None = None,
     parts: Sequence[MeshPart] = (),
     host: str = "127.0.0.1",
     port: int = 0,
-    ready: Callable[[str], object] | None = None,
+    announce: Callable[[str], object] | None = None,
 ) -> bool:
     """Let a person pick the same places on two meshes, on a page of a server; whether they were saved.
 
     Args:
-        source: the animation, whose mesh at rest is shown.
+        source: the animation; its mesh at rest is shown.
         target: the other mesh.
-        file: the .json to write; what is in it already is shown.
-        names: what the page calls both.
+        file: the .json to write; landmarks in it already are shown.
+        names: of both meshes on the page.
         start: landmarks to begin with instead; None for none.
-        shown: numbers of the target's triangles that the face is searched for in; None for all.
+        face_triangles: numbers of the target's triangles in which to search for the face; None for all.
         parts: of the target, which the page can hide.
-        host: address to listen at; by default nobody but this machine reaches it.
+        host: address to listen at; by default this machine alone reaches it.
         port: to listen at; 0 for any free one.
-        ready: called with the page's address as soon as it can be opened.
+        announce: called with the page's address as soon as it can be opened.
     """
     require_server("picking landmarks", extra="serve")
     begin = start if start is not None else file if file.exists() else None
@@ -277,6 +282,6 @@ def pick_landmarks(
         counts = len(source.template), len(target.vertices)
         landmarks = read_landmarks(begin, known_topology(source.template), known_topology(target.vertices), counts)
         landmarks.check(*counts)
-    picking = Picking(source, target, names, file, landmarks, shown, parts)
+    picking = Picking(source, target, names, file, landmarks, face_triangles, parts)
     page = "".join(picking_page(picking))
-    return run_server(lambda stop: make_app(picking, page, names_of(host), stop), host=host, port=port, ready=ready)
+    return run_server(lambda stop: make_app(picking, page, names_of(host), stop), host=host, port=port, ready=announce)

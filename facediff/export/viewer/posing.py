@@ -93,14 +93,14 @@ def sounds(animations: Sequence[Animation]) -> list[list[Any]]:
             rows = parse_json(animation.metadata.get(PHONEMES, "[]"), animation.name)
         except FaceDiffError:  # metadata from elsewhere may say anything
             continue
-        whole = isinstance(rows, list) and all(
+        animation_length = isinstance(rows, list) and all(
             isinstance(row, list)
             and len(row) == 4
             and all(isinstance(seconds, int | float) for seconds in row[:2])
             and all(isinstance(text, str) for text in row[2:])
             for row in rows
         )
-        if whole and rows:
+        if animation_length and rows:
             return rows
     return []
 

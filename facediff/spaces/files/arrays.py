@@ -97,7 +97,9 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     rate = _rate(path, frame_rate, entry, stated_rate)
     parts = []
     for key, columns in (entry.arrays or {}).items():
-        array = _frames(path, key, content[key])
+        with damaged(f"{path}: {key}", "expected numbers (frames, channels)"):
+            array = np.asarray(content[key], np.float64)
+            array = array.reshape(array.shape[-2:])
         # Exact for arrays that belong to the layout alone; SMPL-X's poses have the body's joints around the jaw.
         if array.shape[1] < columns.stop or (columns.start == 0 and array.shape[1] != columns.stop):
             raise FaceDiffError(
@@ -115,12 +117,6 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
         rows = shape.mean(0, keepdims=True) if path.suffix.lower() in HDF5_SUFFIXES else shape
         person = checked(path, (rows if rows.ndim == 2 else rows.reshape(1, -1))[:1], rate)[0]
     return _clip(path, checked(path, values, rate), entry, rate, layout, person)
-
-
-def _frames(path: Path, key: str, array: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or (array.ndim == 3 and len(array) != 1):
-        raise FaceDiffError(f"{path}: {key} holds {array.dtype} {array.shape}; expected numbers (frames, channels)")
-    return np.asarray(array[0] if array.ndim == 3 else array, np.float64)
 
 
 def _rate(path: Path, given_rate: float | None, entry: Layout, stated: float | None = None) -> float:

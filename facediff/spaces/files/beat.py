@@ -37,14 +37,11 @@ def read_beat(path: Path) -> ParameterClip:
     space = _space(path, list(map(str, names)))
     metadata = content.get("metadata")
     stated = metadata.get("fps") if isinstance(metadata, dict) else None
-    if stated is not None:
-        rate = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
     times = _times(path, frames)
-    if times is None or len(times) < 2:
-        if stated is None:
-            raise FaceDiffError(f"{path}: has neither times nor metadata.fps; {REMEDY}")
-    elif stated is None:
+    if stated is None and times is not None and len(times) > 1:
         rate = rate_of(times)
+    else:
+        rate = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
     start = 0.0 if times is None or not len(times) else float(times[0])
     after = None if times is None else times - start
     if after is not None and np.abs(after - np.arange(len(after)) / rate).max(initial=0.0) < 0.25 / rate:

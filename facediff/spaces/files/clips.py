@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.spaces.operations import at_times
 from facediff.spaces.space import Space
 from facediff.utils.hints import check_number
@@ -85,14 +85,9 @@ def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> 
 
 def columns_of(path: Path, header: Sequence[str], space: Space) -> list[int]:
     """The column of each channel of a space in a header, without regard to case."""
-    folded = [name.strip().casefold() for name in header]
-    lacking = [name for name in space.channels if name.casefold() not in folded]
-    if lacking:
-        raise FaceDiffError(
-            f"{path}: has no column {', '.join(lacking[:3])}{' …' if len(lacking) > 3 else ''}; expected those of "
-            f"{len(space.channels)} channels"
-        )
-    return [folded.index(name.casefold()) for name in space.channels]
+    columns = {name.strip().casefold(): index for index, name in reversed(list(enumerate(header)))}
+    with damaged(path, f"expected columns of {len(space.channels)} channels"):
+        return [columns[name.casefold()] for name in space.channels]
 
 
 def shortest(value: np.float32) -> str:

@@ -83,6 +83,15 @@ def rate_of(times: Array) -> float:
     return nearest if abs(measured / nearest - 1) < NEAR_RATE else round(measured, 3)
 
 
+def _rate(path: Path, times: Array, numbers: Sequence[int]) -> float:
+    """The rate of rows with these numbers; refuses times that do not ascend."""
+    later = np.isfinite(times) & (np.diff(times, prepend=-np.inf) > 0)
+    if len(times) < 2 or not later.all():
+        row = f"row {numbers[int(np.argmin(later))]}" if len(times) else "the table"
+        raise FaceDiffError(f"{path}: {row} is alone, or no later than the one before it; expected times that ascend")
+    return rate_of(times)
+
+
 def gaze(names: Sequence[str], weights: Values) -> Array:
     """Rotations of the left and the right eye (T, 6) that weights of ``eyeLook`` shapes stand for.
 
@@ -162,15 +171,9 @@ def _with_mirrored(values: Values) -> Values:
 
 
 def _timed(path: Path, clock: Array, values: Values, lacking: list[str], numbers: list[int]) -> ParameterClip:
-    if len(clock) < 2:
-        raise FaceDiffError(f"{path}: holds {len(clock)} rows; expected two at least, for their rate; record it again")
     # Past midnight the clock begins again.
-    clock = clock + DAY * np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY / 2)
-    steps = np.diff(clock)
-    if (steps <= 0).any():
-        row = numbers[int(np.argmax(steps <= 0)) + 1]
-        raise FaceDiffError(f"{path}: row {row} is no later than the one before it; sort the rows by their timecode")
-    rate = rate_of(clock)
+    clock = clock + DAY * np.cumsum(np.diff(clock, prepend=clock[:1]) < -DAY / 2)
+    rate = _rate(path, clock, numbers)
     space = layout("live_link")
     space = replace(space, absent=(*space.absent, *lacking))
     clip = ParameterClip(
@@ -228,9 +231,7 @@ def read_audio2face(path: Path) -> ParameterClip:
         times.append(_numbers(path, number, full, [at_time], wide)[0])
         values.append(_numbers(path, number, full, columns, wide))
     clock = np.array(times)
-    if len(clock) < 2 or not (np.isfinite(clock).all() and (np.diff(clock) > 0).all()):
-        raise FaceDiffError(f"{path}: its times do not ascend, or there is one row only; write it again")
-    rate = rate_of(clock)
+    rate = _rate(path, clock, range(2, len(clock) + 2))
     numbers, space = checked(path, np.array(values), rate), replace(space, absent=tuple(lacking))
     return ParameterClip(path.stem, numbers, space, rate, clock - clock[0], float(clock[0]), layout="audio2face")
 

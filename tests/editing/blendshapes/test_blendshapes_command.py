@@ -197,13 +197,6 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     assert (tmp_path / "mine.json").read_text() == "{}"
 
 
-def test_the_command_counts_frames_and_shapes(
-    folder: Path, archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["blendshapes", str(archive), "-o", str(tmp_path / "w.csv"), "--shapes", str(folder)]) == 0
-    assert "w.csv: 12 frames, 52 shapes" in capsys.readouterr().out
-
-
 def test_shapes_without_a_column_take_no_motion_from_those_of_the_table(
     folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,11 +35,6 @@ def with_controls(*, controls: AnimationControls) -> None:
     """A command that has the controls only."""
 
 
-def test_nothing_is_on_by_default(make_animation: Callable[..., Animation]) -> None:
-    animation = make_animation(3)
-    assert apply_controls(animation, parsed()) is animation
-
-
 def test_editing_is_imported_only_where_it_is_asked_for() -> None:
     program = (
         "import sys, facediff.pipelines.folder, facediff.export\n"

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.errors import FaceDiffError
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb
@@ -160,11 +159,3 @@ def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:
     (channel,) = animation["channels"]
     assert new.content["nodes"][channel["target"]["node"]] == {"mesh": 1}
     assert new.content["scenes"][new.content["scene"]]["nodes"] == [1, 0]
-
-
-def test_a_compressed_file_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
-    avatar(tmp_path / "avatar.glb")
-    content = opened(tmp_path / "avatar.glb").content | {"extensionsRequired": ["EXT_meshopt_compression"]}
-    (tmp_path / "packed.glb").write_bytes(pack(content, b""))
-    with pytest.raises(FaceDiffError, match=r"packed\.glb.*gltf-transform/cli dequantize"):
-        read_mesh(tmp_path / "packed.glb")

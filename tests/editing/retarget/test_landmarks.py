@@ -39,24 +39,6 @@ from tests.fakes.small_face import LANDMARKS, Shape, build_face, build_rig
 FACE, HEAD = build_face(), build_head()
 
 
-def test_names_are_pairs_of_mirror_images_or_lie_in_the_middle() -> None:
-    found = puppet_landmarks()
-    assert list(found) == list(NAMES)
-    assert len(set(found.values())) == len(NAMES)
-    for name, vertex in found.items():
-        if name.endswith("_left"):
-            assert HEAD.mirror[vertex] == found[name.removesuffix("_left") + "_right"]
-            assert HEAD.vertices[vertex, 0] > 0
-        elif not name.endswith("_right"):
-            assert HEAD.mirror[vertex] == vertex
-
-
-def test_flame_has_every_name_once() -> None:
-    assert list(FLAME) == list(NAMES)
-    assert len(set(FLAME.values())) == len(NAMES)
-    assert max(FLAME.values()) < FLAME_VERTICES
-
-
 @pytest.mark.parametrize("shape", [Shape(), ROUND, LONG, STRONG, YOUNG])
 def test_a_topology_is_known_in_every_unit_and_pose_and_not_in_another_order(shape: Shape) -> None:
     points = shape(HEAD.vertices / 1000)

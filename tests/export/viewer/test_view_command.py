@@ -88,33 +88,3 @@ def test_labels_the_shortest_and_the_browser(files: Path, monkeypatch: pytest.Mo
     assert [animation["name"] for animation in facts(page)["animations"]] == ["Ä <b>", "two"]
     assert facts(page)["frames"] == 40
     assert opened == [page.resolve().as_uri()]
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["guess.npz", "-o", "page.html", "--max-mb", "0.01"], "more than the limit of 0.01 MB"),
-        (["guess.npz", "-o", "page.html", "--max-mb", "-1"], "--max-mb -1"),
-        (["guess.npz", "-o", "page.html", "--labels", "a", "b"], "2 names for 1 panels"),
-        (["missing.npz", "-o", "page.html"], "missing.npz: no such file"),
-        (["true.npy", "-o", "page.html"], "--frame-rate"),
-        (["guess.npz", "empty.npy", "-o", "page.html"], "empty.npy: holds"),
-        (["guess.npz", "nan.npy", "-o", "page.html"], "nan: frame 3 holds NaN"),
-        (["guess.npz", "short.npy", "-o", "page.html"], "short: has 9 frames at"),
-    ],
-)
-def test_view_refuses_in_one_sentence_and_writes_no_page(
-    files: Path, words: list[str], told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(files)
-    vertices = clicks().vertices
-    np.save("empty.npy", vertices[:0])
-    np.save("short.npy", vertices[:9])
-    vertices[3, 0, 0] = np.nan
-    np.save("nan.npy", vertices)
-    before = sorted(files.iterdir())
-    assert main(["view", *words]) == 2
-    error = capsys.readouterr().err
-    assert told in error
-    assert error.count("\n") == 1
-    assert sorted(files.iterdir()) == before
