@@ -59,7 +59,7 @@ class Amounts:
     notes: tuple[tuple[str, str], ...] = ()
 
     def part(self, frames: slice) -> Amounts:
-        """The amounts of some of the frames; the notes are still those of all of them."""
+        """The amounts of some of the frames; the notes stay complete."""
 
         def cut(value: Any) -> Any:  # noqa: ANN401 - an array of frames, numbers, or arrays by name
             if isinstance(value, Mapping):
@@ -192,7 +192,7 @@ class ControlledFace:
                 values = values * (strength > 0 if name == "lids" else strength)
                 limits = channel_of(name).range
                 assert limits is not None  # noqa: S101 - for the type checker
-                # Keys and acting add up, within what the channel allows for keys alone.
+                # Keys and acting add up, within the channel's range for keys alone.
                 poses[name] = np.clip(poses[name] + values if name in poses else values, limits.least, limits.most)
         gaze, degrees = None, curves.get("gaze", controls.gaze)
         if degrees is not None and self.eyes is not None:

@@ -185,7 +185,7 @@ def _open_eyes(vertices: Array, features: Features) -> list[LidEdges]:
 def _rim_places(vertices: Array, lashes: list[Indices], features: Features) -> tuple[Indices, Array]:
     """The place on the edge of a lid that each vertex of lashes moves with, between two vertices of it.
 
-    All vertices of a single lash have one place, that of its root, so that it keeps its shape.
+    All vertices of a single lash have one place, at its root, so that it keeps its shape.
 
     Args:
         vertices: (V, 3) of the mesh.

@@ -66,7 +66,7 @@ def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], n
 def scale_regions(
     animation: Animation, factors: Mapping[str, float | npt.NDArray[np.floating]], eyes: Eyes | None = None
 ) -> Animation:
-    """Scale how far every vertex goes from the neutral face; the arguments are those of :func:`scaled_regions`."""
+    """Scale how far every vertex goes from the neutral face; arguments as in :func:`scaled_regions`."""
     return with_metadata(animation, scaled_regions(animation, factors, eyes), EDITED, expressiveness_words(factors))
 
 

@@ -32,11 +32,11 @@ MOVES = 0.004  # What moves by less than this share of the eye's width is no par
 
 @dataclass(frozen=True)
 class EyeFigures:
-    """What was measured at the fullest blink; None where the animation does not blink, or lids stay at rest.
+    """Figures of the fullest blink; None where the animation does not blink, or lids stay at rest.
 
     Attributes:
         lid_gap: share of the opening that is still seen, of the worse eye; 0 is best.
-        hole: tallest place where shut lids show what is behind them, as a share of the opening's height, of the worse
+        hole: tallest place where shut lids are open, as a share of the opening's height, of the worse
             eye; where few triangles are large, a lid tears though most of it is shut.
         overshoot: how far the upper lid passes the lower one, as a share of the opening.
         inside: share of the lids' vertices that lie inside the eyeball.
@@ -66,7 +66,7 @@ def check_eyes(
         frames: numbers of the frames in which the forehead is looked at.
 
     Returns:
-        the figures, None where the animation's face shows no eyes; what is wrong, a clause each; and remarks.
+        the figures, None where the animation's face shows no eyes; faults, a clause each; and remarks.
     """
     source, target = correspondence.features
     if source is None or target is None:
@@ -102,7 +102,7 @@ def check_eyes(
             gap, hole = _still_seen(rest, posed, target, eye)
             gaps.append(gap)
             holes.append(hole)
-            # Painted lids of the source may not shut either: what is left open there is no fault of the target.
+            # Painted lids of the source may not shut either, which is no fault of the target.
             expected.append(_still_seen(face, original, source, eye)[0])
             passed.append(_overshoot(target_edges[eye], rest.vertices, posed))
             inside.append(_inside_ball(rest, posed, target, eye))
@@ -272,8 +272,8 @@ def _forehead(
             continue
         posed_lengths = np.linalg.norm(posed[pairs[some, 0]] - posed[pairs[some, 1]], axis=1)
         change = np.abs(np.log(np.maximum(posed_lengths, 1e-12) / lengths[some]))
-        # An edge that halves counts as one that doubles. One of 200 may do what it likes: scans have slivers whose
-        # length is noise.
+        # An edge that halves counts as one that doubles. One of 200 is ignored: scans have slivers with noisy
+        # lengths.
         stretch = max(stretch, float(np.expm1(np.quantile(change, 0.995))))
         turned |= (_face_normals(posed, faces) * normals).sum(axis=1) < 0
         moving |= moves[faces].any(axis=1)

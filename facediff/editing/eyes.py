@@ -127,7 +127,7 @@ def _read_json(
         with damaged(f"eyes {path}", 'give shapes of this face, and the open face of the same mesh as "neutral"'):
             for name in record.blinks:
                 shape = _read_shape(path, name)
-                total = total + (shape if Path(name).suffix.lower() == ".npy" else np.subtract(shape, neutral))
+                total = total + (shape if Path(name).suffix.lower() == ".npy" else np.subtract(shape, neutral))  # type: ignore[arg-type]
         return total, neutral, balls, brows
     if record.lids:
         edges = [(_indices(path, lid.upper, count, 2), _indices(path, lid.lower, count, 2)) for lid in record.lids]

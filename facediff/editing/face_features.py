@@ -51,7 +51,7 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What a mesh shows of a face."""
+    """Openings and skin of a face mesh."""
 
     mouth: Opening
     eyes: tuple[Opening | None, Opening | None]  # at smaller and at larger x
@@ -122,7 +122,7 @@ class FrontView:
         """(V,) one number for all vertices in one place that a seam of a texture parts; lips that touch stay apart.
 
         A seam lies on the border of the mesh, which the inside of lips that touch does not. The border runs in loops: a
-        cut, such as that between the closed lips of a mask, is one loop whose two halves lie on one another.
+        cut, such as that between the closed lips of a mask, is one loop with two halves on one another.
         """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
@@ -307,7 +307,7 @@ class FrontView:
         # round one of the corners. The share of the width keeps bumps from counting as openings.
         limit = FARTHER * straight + PARTED * expected
         parted = self._ways_between(graph, rows_of, (first, second), (a, b), limit) > limit
-        # What is seen through a hole lies behind its rims, and the way round the hole may be short.
+        # Points seen through a hole lie behind its rims, and the way round the hole may be short.
         parted |= pairs[:, 1] - pairs[:, 0] > max(2, HOLE * PIXELS)
         pairs, above, below, first, second = (part[parted] for part in (pairs, above, below, first, second))
         selection = _widest(pairs, columns, window, step, low)
@@ -459,7 +459,7 @@ def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low
         if wide < LEAST:
             continue
         centre = low[0] + step * pairs[some, 2].mean()
-        # Width counts up to 1.3 of what is expected, so that a wide gap elsewhere does not beat the mouth in the
+        # Width counts up to 1.3 of the expected one, so that a wide gap elsewhere does not beat the mouth in the
         # middle.
         worth = min(wide, 1.3) - 1.0 * abs(centre - window.x) / window.expected
         if worth > best_worth:
@@ -512,7 +512,7 @@ ASIDE = 0.3, 0.7
 """An opening further away from where the mouth is expected, across and up in its widths, is an eye or a nostril."""
 OPEN_MOUTH, OPEN_EYE = (0.35, 0.12), (0.7, 0.35)
 """How far apart the sides of an opening may stand at rest, and how far behind them its inside begins, as shares of its
-width. A socket is a hollow: what is inside of an eye lies deeper than that."""
+width. A socket is a hollow: the inside of an eye lies deeper than that."""
 
 
 def find_features(vertices: Array, faces: Indices, expected: Features | Opening | None = None) -> Features | None:
@@ -578,7 +578,7 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
 
 
 def _anywhere(view: FrontView) -> Opening | None:
-    """The widest opening about the middle of the lower part of what is seen."""
+    """The widest opening about the middle of the lower part of the view."""
     points = view.vertices[np.unique(view.faces)]
     low, high = points.min(axis=0), points.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)

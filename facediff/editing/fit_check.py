@@ -33,7 +33,7 @@ TORN = 0.2  # Share of the lips' edges that may move otherwise
 
 @dataclass(frozen=True)
 class FitReport:
-    """What was measured; None where the animation does not show it.
+    """Figures of a fit; None where the animation does not show it.
 
     Attributes:
         lip_ratio: gap at rest over gap at the widest between the mesh's own lips; 0 is best.
@@ -43,8 +43,8 @@ class FitReport:
         crossed: share of pairs and frames in which upper and lower lip pass through one another.
         covered: share of the animation's motion for which the mesh has a place.
         eyes: the upper face's figures.
-        faults: what is wrong, a clause each; empty if the result can be used.
-        remarks: what is not as in the animation and no fault, a clause each.
+        faults: a clause each; empty if the result can be used.
+        remarks: differences from the animation that are no fault, a clause each.
     """
 
     lip_ratio: float | None
@@ -169,7 +169,7 @@ def telling_frames(animation: Animation, correspondence: Correspondence) -> dict
 
 def _lip_faults(ratio: float, limit: float, opened: float, torn: float, crossed: float) -> list[str]:
     faults = []
-    # A mouth that stands open at rest has a high ratio too; what it opens by tells it from one whose lips are glued.
+    # A mouth that stands open at rest has a high ratio too; its opening tells it from a mouth with glued lips.
     if ratio > limit and (opened < CLEARLY_OPENS or torn > 0):
         faults.append(f"its lips do not part as the animation's do: {ratio:.2f} of their widest gap is there at rest")
     if opened < OPENS:
@@ -182,7 +182,7 @@ def _lip_faults(ratio: float, limit: float, opened: float, torn: float, crossed:
 
 
 def _opened(grown: Array, expected: Array) -> float:
-    """Least growth of the gap over the mouth's thirds, as a share of what is expected of them."""
+    """Least growth of the gap over the mouth's thirds, as a share of the expected growth."""
     return min(
         float(grown[third].mean() / max(expected[third].mean(), 1e-12))
         for third in np.array_split(np.arange(len(grown)), 3)
@@ -199,7 +199,7 @@ def _torn(
     matrix: Array,
     opening: float,
 ) -> float:
-    """Share of the lips' edges whose motion differs by half of the mouth's opening from what is expected there."""
+    """Share of the lips' edges with motion that differs by half of the mouth's opening from the expected one."""
     expected = (np.float64(animation.vertices[frame][pairs]) - animation.template[pairs]) @ matrix.T
     moved = np.float64(carried.vertices[frame][facing]) - carried.template[facing]
     return float(np.mean(np.linalg.norm(moved - expected, axis=2) > 0.5 * opening))

@@ -1,7 +1,7 @@
-"""Eyelids of one mesh moved as those of another: each lid goes the share of its own eye's opening.
+"""Eyelids of one mesh moved like another mesh's: each lid goes the share of its own eye's opening.
 
 Displacements of lids cannot be copied: on an eye that opens further the lids would not meet, on a narrow one they would
-pass. What the edges of the source's lids do is therefore read along their curves, expressed in the height and width of
+pass. The motion of the source's lid edges is therefore read along their curves, expressed in the height and width of
 the source's eye, and written along the curves of the target's. The skin around follows its lid, less and less. What
 else moves about the eye, such as a brow, is carried as everywhere.
 """
@@ -125,7 +125,7 @@ class EyeLids:
     clearance: Array  # (N,) how far in front of the eyeball the vertices of the target's field stay
 
     def target_edges(self, moves: Array) -> Array:
-        """Displacements (T, 2, SAMPLES, 3) of the target's edges, for those of the source's along its axes."""
+        """Displacements (T, 2, SAMPLES, 3) of the target's edges, from the source's along its axes."""
         assert self.target is not None  # noqa: S101 - for type checkers
         source_gaps, target_gaps = self.source.gaps, self.target.gaps
         least = EVENED * np.array([self.source.height, self.target.height])
@@ -137,7 +137,7 @@ class EyeLids:
         # Closing lids meet in depth as well; how far they bulge in front of the straight way is the source's.
         travel = moves[..., 1] / (source_gaps[:, 1] + least[0])
         edges[..., 2] = wide * (moves[..., 2] - travel * source_gaps[:, 2]) + travel * target_gaps[:, 2]
-        # What is left of the opening is exactly the source's share, and never less than none: lids do not pass.
+        # The rest of the opening is exactly the source's share, and never less than none: lids do not pass.
         left = source_gaps[:, 1] + moves[:, 0, :, 1] - moves[:, 1, :, 1]
         left = (left + EVENED * left.mean(axis=1, keepdims=True)) / (source_gaps[:, 1] + least[0])
         # In the corners, where there is hardly an opening, the share of the whole eye says more than their own, and
@@ -145,7 +145,7 @@ class EyeLids:
         mean_left = np.maximum(left @ source_gaps[:, 1] / source_gaps[:, 1].sum(), 0.0)[:, None]
         open_here = np.clip(source_gaps[:, 1] / (CORNER * source_gaps[:, 1].max()), 0.0, 1.0)
         left = np.minimum(open_here * left + (1.0 - open_here) * mean_left, MORE * mean_left)
-        # Edges are read to a few hundredths of the opening: what is nearly shut is shut.
+        # Edges are read to a few hundredths of the opening: nearly shut is shut.
         left = np.maximum(left - SHUTS, 0.0) / (1.0 - SHUTS)
         # Shut, the upper edge lies a little over the lower one, so that no gap shows between coarse edges.
         lap = (LAP + ROUGH * self.target.step / self.target.height) * target_gaps[:, 1] * np.maximum(1.0 - left, 0.0)
@@ -366,7 +366,7 @@ def without_lids(lids: list[EyeLids], displacements: Array) -> tuple[Array, list
 
 
 def with_lids(lids: list[EyeLids], vertices: Array, displacements: Array, edges: list[Array]) -> None:
-    """Add what the lids do to displacements (T, Vt, 3) of a target's vertices (Vt, 3), both in the source's axes."""
+    """Add the lids' motion to displacements (T, Vt, 3) of a target's vertices (Vt, 3), both in the source's axes."""
     for eye, moves in zip(lids, edges, strict=True):
         if eye.target is None:
             continue

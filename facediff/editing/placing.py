@@ -1,4 +1,4 @@
-"""The similarity that aligns two face meshes of unknown unit, axes and vertices, whatever else the meshes show."""
+"""The similarity that aligns two face meshes of unknown unit, axes and vertices, also if they show other parts."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def place(
 ) -> Similarity:
     """The similarity that aligns one surface with another.
 
-    Starts are the 24 rotations of one frame of axes into another and those of principal axes, with sizes made equal;
+    Starts are the 24 rotations of one frame of axes into another and the principal axes, with sizes made equal;
     the best by nearest vertices, both ways and trimmed, is refined by nearest points of the surface: Besl and McKay, "A
     method for registration of 3-D shapes", PAMI 1992, and Chen and Medioni, "Object modelling by registration of
     multiple range images", IVC 1992 (distances to planes).
@@ -145,7 +145,7 @@ WITH_MOUTH, WITH_EYE = 0.5, 0.85
 def place_face(
     moved: Surface, goal: Surface, features: Features, start: Similarity | None = None
 ) -> tuple[Similarity, Features | None]:
-    """The similarity that lays a mesh onto another one's face, and what is seen of the mesh there.
+    """The similarity that lays a mesh onto another one's face, and the features of the mesh there.
 
     The goal's visible face is searched for on the moved mesh: from the 24 rotations of one frame of axes into another,
     in all of the mesh, in each of its larger pieces and at the ends of a long one, by nearest vertices that face the
@@ -213,7 +213,7 @@ def _face_of(surface: Surface, features: Features) -> tuple[Array, Array]:
     points = np.einsum("nk,nkd->nd", shares, surface.vertices[corners])
     normals = np.einsum("nk,nkd->nd", shares, surface.normals[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    # Through the holes of eyes whose balls are pieces of their own, the back of the head is seen from within.
+    # Through the holes of eyes with separate balls, the back of the head is seen from within.
     front = normals[:, 2] > 0
     return points[front], normals[front]
 
@@ -269,7 +269,7 @@ def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple
     for part in (moved.vertices[vertices], *(part for part in parts if LEAST_GROUP <= len(part) < len(vertices))):
         extent = np.ptp(part, axis=0)
         for axis, sign in itertools.product(range(3), (1, -1)):
-            # Much longer than wide: a figure or a bust, whose face is at one of its ends.
+            # Much longer than wide: a figure or a bust, with the face at one end.
             if extent[axis] < 1.6 * np.sort(extent)[0]:
                 continue
             along = sign * part[:, axis]
@@ -306,7 +306,7 @@ def _round(
     distance, index = distance.reshape(laid.shape[:2]) / scale[:, None], index.reshape(laid.shape[:2])
     cosine = np.einsum("bnd,bnd->bn", normals @ rotation.swapaxes(1, 2), facing[index])
     agree = cosine > 0.3
-    # The cap keeps what the other mesh lacks, such as hair, from deciding between alignments.
+    # The cap keeps parts that the other mesh lacks, such as hair, from deciding between alignments.
     apart = np.where(agree, np.minimum(distance / cap, 1.0), 1.0).mean(axis=1)
     limit = np.quantile(np.where(agree, distance, np.inf), 0.75, axis=1, method="lower")
     limit = np.where(np.isfinite(limit), limit, cap)

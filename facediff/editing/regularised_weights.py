@@ -34,7 +34,7 @@ class Regularisation:
     Attributes:
         l1: keeps the sum of the weights small.
         l2: keeps each weight small.
-        temporal: keeps weights near those of the frame before.
+        temporal: keeps weights near the frame before.
         symmetry: keeps the weights of a symmetric pair alike.
         template_size: diagonal of the face for which the strengths are stated; they grow with the square of the size.
         temporal_term: ``published`` or ``corrected``.

@@ -68,7 +68,7 @@ def retarget(
         landmarks_path: CSV or JSON of landmarks, for a correspondence that does not exist yet.
         parts: names of the parts of the file that show the face, see :func:`facediff.mesh.parts.named_triangles`; it is
             searched for in all of them if there are none.
-        check: called with the result in the mesh's own axes and what was measured of it, before a new correspondence is
+        check: called with the result in the mesh's own axes and its fit report, before a new correspondence is
             written; raises where it should not be. Where it raises and both meshes are of known topologies, their named
             landmarks are tried. Nothing is measured if None.
         whole_head: as of :func:`transfer`.
@@ -181,7 +181,7 @@ def parts_with_a_face(animation: Animation, path: Path, mesh: Mesh) -> list[str]
 def transfer_checked(
     animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False
 ) -> tuple[Animation, Correspondence, FitReport]:
-    """The motion of an animation on a target mesh, the correspondence that carried it, and what was measured of it.
+    """The motion of an animation on a target mesh, the correspondence that carried it, and the fit report.
 
     Where a result is poor, its eyes are carried another way: lids go the share of their own opening, if they did not
     yet, and else stay at rest. That result counts if nothing else is wrong.
@@ -285,7 +285,7 @@ def _carried_head(
 
 
 def transfer_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:
-    """Displacements of the source's vertices (T, Vs, 3) as those of the target's (T, Vt, 3), in its unit and axes.
+    """Displacements of the source's vertices (T, Vs, 3) on the target's (T, Vt, 3), in its unit and axes.
 
     Each target vertex takes the weighted mean of its triangle's corners, turned and scaled by the similarity. Where
     its place on the source is not well known, neighbours are averaged; where it is far from anything, motion fades.
@@ -306,7 +306,7 @@ def transfer_displacements(correspondence: Correspondence, displacements: npt.ND
         columns = carried.transpose(1, 0, 2).reshape(carried.shape[1], -1)
         trusted = correspondence.trust[:, None] * columns
         # Jacobi steps of x = trust · x₀ + (1 − trust) · mean of the neighbours: each carries trusted motion one edge
-        # further into what is not trusted.
+        # further into untrusted vertices.
         for _ in range(ROUNDS):
             columns = trusted + smoothing @ columns
         carried = columns.reshape(carried.shape[1], carried.shape[0], 3).transpose(1, 0, 2)
@@ -345,7 +345,7 @@ def unit_of(unit: str, scale: float) -> str:
 
 
 def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integer]) -> Indices:
-    """A region of the source as that of the target: vertices whose place is more inside than out, and that move."""
+    """A region of the source on the target: vertices that lie more inside than out, and move."""
     member = np.zeros(len(correspondence.source_vertices))
     member[indices] = 1.0
     # The barycentric mean of a region's membership says how much of a vertex's place is inside.
@@ -354,7 +354,7 @@ def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integ
 
 
 def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer] | None) -> Indices | None:
-    """Pairs of facing vertices of the source as those of the target's vertices that lie there, each pair once."""
+    """Pairs of facing vertices of the source as pairs of the target's vertices there, each pair once."""
     if pairs is None or not len(pairs):
         return None
     facing_vertices = facing_pairs(correspondence, pairs)
@@ -365,7 +365,7 @@ def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]
 def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]) -> Indices:
     """For each pair (P, 2) of facing vertices of the source, a pair of the target's.
 
-    Of the vertices whose places are near to the source's and on the same lip, those two face each other that are
+    Of the vertices that lie near to the source's and on the same lip, those two face each other that are
     nearest to one another: on a coarse mesh the very nearest ones may lie far apart.
     """
     source = Surface(correspondence.source_vertices, correspondence.source_faces)
@@ -510,7 +510,7 @@ def load_correspondence(path: Path) -> Correspondence:
 
 
 def _is_array(array: npt.NDArray[np.generic], kind: str, axes: int) -> bool:
-    return array.dtype.kind == kind and array.ndim == axes and bool(np.isfinite(array).all())  # type: ignore[call-overload]
+    return array.dtype.kind == kind and array.ndim == axes and bool(np.isfinite(array).all())
 
 
 def _consistent(parts: Correspondence) -> bool:

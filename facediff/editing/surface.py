@@ -25,13 +25,14 @@ size: lips that touch are two sheets in one place."""
 FACING, AWAY = 0.3, -0.3
 """Cosines between normals from which on two sheets face the same way, and up to which they face away."""
 TIE = 1e-6
-"""Of two places whose distances differ by less than this share of a triangle, the one that faces the same way wins."""
+"""Of two points with distances that differ by less than this share of a triangle, the one that faces the same way
+wins."""
 CHUNK_NUMBERS = 4_000_000  # Candidate pairs of a point and a triangle that are held in memory at a time, at most
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh (V, 3), (F, 3) whose nearest points can be searched for."""
+    """A triangle mesh (V, 3), (F, 3) with a search for nearest points."""
 
     vertices: Array
     faces: Indices
@@ -95,8 +96,8 @@ def nearest(surface: Surface, points: Array, normals: Array, size: float | None 
     """The nearest point of a surface to each point (N, 3), where normals decide between sheets.
 
     Every triangle that could hold it is looked at, so that the point found is the nearest of all of its sheet. Normals
-    (N, 3) are zero where a point has none. The slack between sheets is relative to ``size``, that of the surface if
-    None; at 0, the nearest point counts, whatever its normal.
+    (N, 3) are zero where a point has none. The slack between sheets is relative to ``size``, the surface's if None;
+    at 0, the nearest point counts with any normal.
     """
     slack = SLACK * (surface.size if size is None else size)
     faces, weights, cosines = _best(surface, points, normals, 0.0)

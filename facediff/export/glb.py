@@ -383,7 +383,7 @@ def gltf_rotations(quaternions: npt.NDArray[np.float64]) -> Array:
 
 
 def add_nodes(document: GlbWriter, frame_rate: float, added: Sequence[MovingNode]) -> None:
-    """Add nodes to a document of :func:`make_document`, whose only node is the face; a head carries all others."""
+    """Add nodes to a document of :func:`make_document`, where the face is the only node; a head carries all others."""
     nodes, siblings = document.content["nodes"], document.content["scenes"][0]["nodes"]
     (motion,) = document.content["animations"]
     times: int | None = None  # of all curves

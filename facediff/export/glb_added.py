@@ -26,7 +26,7 @@ Array = npt.NDArray[np.float64]
 def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: float) -> None:
     """Write a copy of a .glb in which the meshes of an animation move.
 
-    The parts of the file that move get further morph targets after their own, whose default weights stay, and one
+    The parts of the file that move get further morph targets after their own (default weights stay), and one
     animation drives them. Texture coordinates, materials, images, skins, nodes, extensions and other animations
     are written as they are; an animation of a moving mesh's own weights gets zeros for the new targets, and a mesh that
     several nodes show becomes one of its own for each node that moves. Where a part has normals, they turn with it.
@@ -46,7 +46,7 @@ def add_to_glb(path: Path, target: Path, animation: Animation, tolerance_mm: flo
 
 
 def open_to_add(target: Path) -> tuple[Glb, GlbWriter]:
-    """A .glb from elsewhere, and a writer that appends to its content; the errors are those of reading it."""
+    """A .glb from elsewhere, and a writer that appends to its content; errors as in reading it."""
     glb = open_glb(target)
     for kind in ("buffers", "bufferViews", "accessors"):
         glb.entries(kind)  # refuses what is no list, to which the writer could not append
@@ -163,7 +163,7 @@ def _targets(
     turns: _Turns,
     offsets: Array,
 ) -> list[dict[str, int]]:
-    """Accessors of the new targets of a primitive, whose vertices are some rows of those that move."""
+    """Accessors of the new targets of a primitive; its vertices are these rows of the moving ones."""
     shape_offsets = part.returned(np.asarray(morphs.shapes[:, rows], np.float64)).astype(np.float32)
     targets = [
         {"POSITION": writer.add(offsets_of_target, target=ARRAY_BUFFER, bounds=True)}

@@ -22,10 +22,10 @@ LIMIT = 2**32 - 1  # The most bytes that the header of a .glb can count
 
 
 class GlbWriter:
-    """A document whose arrays are appended to its binary chunk.
+    """A document with arrays appended to its binary chunk.
 
     Args:
-        content: the document; what it has already stays.
+        content: the document; its present content stays.
         binary: the binary chunk that it has already.
     """
 
@@ -49,7 +49,7 @@ class GlbWriter:
 
         Args:
             array: float32, uint16 or uint32.
-            target: what a graphics card uses it for, such as ``ARRAY_BUFFER``.
+            target: its use by a graphics card, such as ``ARRAY_BUFFER``.
             bounds: whether the least and the greatest numbers are written, as positions and times need.
         """
         array = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))

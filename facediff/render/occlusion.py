@@ -24,14 +24,14 @@ def sky_seen(vertices: npt.NDArray[np.floating[Any]], faces: npt.NDArray[np.inte
 
     The mesh is looked at along evenly spread lines; a vertex is hidden where the depth map of a line has something in
     front of it (Zhukov et al., "An ambient light illumination model", 1998, for the quantity). On a convex body nothing
-    hides anything, whatever the resolution.
+    hides anything, at any resolution.
 
     Args:
         vertices: (V, 3), in any unit.
         faces: triangles (F, 3), counter-clockwise seen from outside.
     """
     points = np.asarray(vertices, np.float64)
-    # Only what is drawn matters: a lost vertex must not set the scale.
+    # Only drawn vertices matter: a lost vertex must not set the scale.
     drawn_points = points[np.unique(faces)]
     cell = max(float(np.ptp(drawn_points, axis=0).max()) / CELLS, 1e-12)
     samples = _surface(points, faces, cell)

@@ -436,7 +436,7 @@ class _Canvas:
     """A depth buffer and three interpolated values per sample."""
 
     GRID = 8
-    """Windows start and end on multiples of this many pixels: what is computed on a coarser grid inside them would
+    """Windows start and end on multiples of this many pixels: values on a coarser grid inside them would
     otherwise shimmer where a window grows with the motion."""
 
     def __init__(self, camera: Camera, height: int, width: int, supersample: int) -> None:
@@ -481,7 +481,7 @@ class _Canvas:
         settings = cv2.TriangleRasterizeSettings()
         settings.setShadingType(cv2.RASTERIZE_SHADING_SHADED)
         # Depth stays as the rasteriser computes it (0 at the near plane, 1 at the far plane and where nothing is). Its
-        # other mode converts to distances and back around every call and loses what a second pass adds: the empty
+        # other mode converts to distances and back around every call and loses the second pass: the empty
         # samples come back a rounding error behind the far plane and are never drawn again.
         settings.setGlCompatibleMode(cv2.RASTERIZE_COMPAT_INVDEPTH)
         settings.setCullingMode(cv2.RASTERIZE_CULLING_CW)

@@ -20,14 +20,14 @@ class Refinement:
     """Splits long edges in the middle, again and again; the surface stays where it is.
 
     Light is computed per vertex and interpolated over triangles, which shows facets where triangles are large and
-    none where they are small. What is split is decided once, on the template: an edge belongs to all its triangles, so
+    none where they are small. Edges to split are chosen once, on the template: an edge belongs to all its triangles, so
     that no gap opens between them, and frames differ by motion only.
 
     Args:
         faces: triangles (F, 3).
         template: positions (V, 3).
         longest: edges of the template that are longer are split, in the template's unit.
-        normals: unit normals (V, 3); where those of an edge's ends differ by `SHARP`, half that length is too long.
+        normals: unit normals (V, 3); where they differ by `SHARP` along an edge, half that length is too long.
         shortest: edges that are not longer than this are never split.
 
     Attributes:
@@ -64,7 +64,7 @@ class Refinement:
         self.n_vertices = len(points)
 
     def values(self, values: Float32) -> Float32:
-        """Values of the vertices (V, channels) and, below them, those of the vertices that were added."""
+        """Values of the vertices (V, channels) and, below them, values of the added vertices."""
         for pairs in self._rounds:
             values = _with_middles(values, pairs)
         return values
@@ -81,7 +81,7 @@ def _split_long_edges(faces: Faces, points: Float32, longest: float, shortest: f
     """One round, given positions and normals (V, 6).
 
     Returns:
-        The triangles after it, and the pairs of vertices in whose middles it added others, in their order.
+        The triangles after it, and the pairs of vertices with a new vertex in their middle, in order.
     """
     n_vertices = len(points)
     starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()  # edge k of a face leads from corner k to k + 1
@@ -101,7 +101,7 @@ def _split_long_edges(faces: Faces, points: Float32, longest: float, shortest: f
         one = (count == 1) & (mid[:, 0] >= 0)
         (a, b, c), m = corner[one].T, mid[one, 0]
         parts += [np.column_stack([a, m, c]), np.column_stack([m, b, c])]
-        # Two: the corner between them is cut off, and what is left is cut along a diagonal.
+        # Two: the corner between them is cut off, and the rest is cut along a diagonal.
         two = (count == 2) & (mid[:, 2] < 0)
         (a, b, c), (m, n, _) = corner[two].T, mid[two].T
         parts += [np.column_stack([m, b, n]), np.column_stack([a, m, n]), np.column_stack([a, n, c])]

@@ -36,7 +36,7 @@ OPUS_RATES = (48000, 24000, 16000, 12000, 8000)
 
 
 class Codecs(NamedTuple):
-    """What a container holds: the names and options of its encoders, and the rates that its sound may have."""
+    """A container: the names and options of its encoders, and the rates that its sound may have."""
 
     video: str
     options: Mapping[str, str]
@@ -60,7 +60,7 @@ def write_video(
     audio: npt.NDArray[np.float32] | None = None,
     sample_rate: int | None = None,
 ) -> int:
-    """Write a video whose sound starts with its first frame.
+    """Write a video with sound that starts with its first frame.
 
     The file appears under its name only when it is complete: until then it is a hidden sibling, which is removed if
     anything fails (so is every folder that had to be made). The same input gives the same pictures bit by bit; the

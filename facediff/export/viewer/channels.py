@@ -1,4 +1,4 @@
-"""What a page must know of the weights that a motion was made of, to give them to its reader under their names."""
+"""Facts of the weights of a motion for a page, which offers them for download under their names."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def channel_facts(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
 
 
 def _scene(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
-    """What a .glb with targets under the weights' names is made of, in metres; None if the weights do not say it."""
+    """Content of a .glb with targets under the weights' names, in metres; None if the weights do not determine it."""
     space = FileSpace.of(animation, ExportOptions(), "m")
     still = animation.still()
     shapes = weighted_shapes(still, space, TOLERANCE / 1000)
@@ -62,7 +62,7 @@ def _scene(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
         "nodes": [
             {
                 "name": node.name,
-                "place": None if node.place is None else node.place.tolist(),
+                "place": None if node.translation is None else node.translation.tolist(),
                 "curves": {path: blobs.add(curve.astype("<f4").tobytes()) for path, curve in node.curves.items()},
             }
             for node in moving_nodes(still, space, animation.head)

@@ -1,4 +1,4 @@
-"""What the page's editor must know of a face to pose it, and what rules have already done to a take."""
+"""Facts of a face for the page's editor to pose it, and motion that rules have already added to a take."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BLINKS = re.compile(r"blinks \(([0-9.]+) a minute, seed ([0-9]+)\)")
 def pose_fields(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
     """Displacements of a built-in face in steps, as numbers of blobs: of brows, lids and ARKit's shapes.
 
-    Those of other faces are carried over by ``facediff animate``, which takes seconds; a page does without.
+    For other faces ``facediff animate`` carries them over, which takes seconds; a page does without.
     """
     shapes = own_shapes(animation.template, animation.faces)
     eyes = puppet_eyes(animation.template, animation.faces)
