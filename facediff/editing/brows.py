@@ -11,7 +11,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.animation import metres_per_unit
 from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.eyes import Array, Eyes
+from facediff.editing.eyelids import Array, Eyes
 from facediff.editing.procedural import copied
 from facediff.errors import OptionError
 

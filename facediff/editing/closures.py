@@ -9,7 +9,7 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.animation.animation import metres_per_unit
 from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.eyes import Array
+from facediff.editing.eyelids import Array
 from facediff.editing.procedural import EDITED, copied, with_metadata
 from facediff.errors import FaceDiffError
 from facediff.utils.numerics import smooth_step

@@ -20,7 +20,7 @@ from facediff.editing import procedural
 from facediff.editing.controls import keys_of, refuse_folder
 from facediff.editing.direction import METADATA, Direction, channel_of, curve, direction_of
 from facediff.editing.expressiveness import expressiveness_words, scaled_regions
-from facediff.editing.eyes import GIVE, Array, Eyes, eyes_for
+from facediff.editing.eyelids import GIVE, Array, Eyes, eyes_for
 from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, with_metadata
 from facediff.errors import FaceDiffError, OptionError
 

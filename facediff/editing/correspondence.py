@@ -16,7 +16,7 @@ import numpy.typing as npt
 from facediff.editing.detached_parts import detached_parts, lash_pieces
 from facediff.editing.face_features import OPPOSITE, Features, find_features
 from facediff.editing.landmarks import Landmarks
-from facediff.editing.lids import EyeLids, eye_lids
+from facediff.editing.lid_transfer import EyeLids, eye_lids
 from facediff.editing.placing import place, place_face
 from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.editing.face_features import Features, Opening
-from facediff.editing.lids import LidEdges, along, lid_edges
+from facediff.editing.lid_transfer import LidEdges, along, lid_edges
 from facediff.editing.surface import Nearest, Surface, nearest
 
 Array = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.options import Scales, scales_text
-from facediff.editing.eyes import Array, Eyes, Indices
+from facediff.editing.eyelids import Array, Eyes, Indices
 from facediff.editing.procedural import EDITED, allocate_like, in_words, with_metadata
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.utils.hints import Range, read

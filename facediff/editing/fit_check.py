@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.correspondence import Correspondence
-from facediff.editing.eye_check import EyeFigures, check_eyes, fullest_blink, raised_brows
-from facediff.editing.lids import lid_edges
+from facediff.editing.eye_fit import EyeFigures, check_eyes, fullest_blink, raised_brows
+from facediff.editing.lid_transfer import lid_edges
 from facediff.editing.surface import Surface, nearest
 from facediff.errors import OptionError
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.eyes import Array, Eyes
+from facediff.editing.eyelids import Array, Eyes
 from facediff.mesh.flame import rotations
 from facediff.utils import ranges
 from facediff.utils.files import reserve_room

@@ -27,7 +27,7 @@ from facediff.editing.correspondence import (
 from facediff.editing.face_features import facing, find_features, sides_of_pairs
 from facediff.editing.fit_check import FitReport, check_fit
 from facediff.editing.landmarks import Landmarks, common_landmarks, known_topology, read_landmarks
-from facediff.editing.lids import swing, with_lids, without_lids
+from facediff.editing.lid_transfer import swing, with_lids, without_lids
 from facediff.editing.placing import place_face
 from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from facediff.data import Reference
-    from facediff.editing.eyes import Array
+    from facediff.editing.eyelids import Array
     from facediff.models import AnimationModel, Style
 
 MOST_RUNS = 32

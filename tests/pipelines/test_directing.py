@@ -19,7 +19,7 @@ from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
 from facediff.editing.direction import CHANNELS, METADATA, Direction, Key, read_direction, text_shares
 from facediff.editing.expressiveness import region_factors
-from facediff.editing.eyes import puppet_eyes
+from facediff.editing.eyelids import puppet_eyes
 from facediff.errors import FaceDiffError
 from facediff.pipelines.folder import animate_folder
 from facediff.speech.audio import read_speech

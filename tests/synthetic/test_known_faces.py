@@ -9,7 +9,7 @@ import pytest
 
 from facediff.cli.app import main
 from facediff.editing.brows import brows_of
-from facediff.editing.eyes import puppet_eyes
+from facediff.editing.eyelids import puppet_eyes
 from facediff.editing.landmarks import NAMES, known_topology, puppet_landmarks
 from facediff.editing.shapes import read_shapes
 from facediff.spaces.arkit import ALPHABETICAL

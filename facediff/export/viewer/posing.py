@@ -14,7 +14,7 @@ from facediff.animation.animation import PHONEMES
 from facediff.editing import direction, procedural
 from facediff.editing.brows import brows_of
 from facediff.editing.controlled import ACTED
-from facediff.editing.eyes import puppet_eyes
+from facediff.editing.eyelids import puppet_eyes
 from facediff.editing.face_shapes import own_shapes
 from facediff.errors import FaceDiffError
 from facediff.export.viewer.packing import Blobs, millimetres

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.eyes import Eyes
+from facediff.editing.eyelids import Eyes
 from facediff.editing.procedural import add_blinks, blink_curve
 from facediff.synthetic.head.parts import build_head
 

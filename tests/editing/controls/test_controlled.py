@@ -18,7 +18,7 @@ from facediff.editing.controlled import apply_controls
 from facediff.editing.controls import check_controls
 from facediff.editing.direction import MOODS, Direction, Key, read_direction
 from facediff.editing.expressiveness import scale_regions
-from facediff.editing.eyes import Eyes
+from facediff.editing.eyelids import Eyes
 from facediff.editing.procedural import add_blinks, add_gaze, add_sway
 from facediff.errors import FaceDiffError
 from facediff.synthetic.known_faces import built_in_rig

@@ -9,7 +9,7 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.expressiveness import FALL_OFF, region_factors, scale_regions
-from facediff.editing.eyes import Eyes
+from facediff.editing.eyelids import Eyes
 
 
 def test_one_factor_scales_every_offset(make_animation: Callable[..., Animation]) -> None:

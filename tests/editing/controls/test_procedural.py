@@ -11,7 +11,7 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.expressiveness import scale_regions
-from facediff.editing.eyes import Eyes
+from facediff.editing.eyelids import Eyes
 from facediff.editing.procedural import (
     add_blinks,
     add_gaze,

@@ -16,7 +16,7 @@ from facediff.animation.options import AnimationControls
 from facediff.cli.parsing import parameters_of, parse
 from facediff.editing.controlled import apply_controls
 from facediff.editing.controls import check_controls
-from facediff.editing.eyes import Eyes, puppet_eyes, read_eyes
+from facediff.editing.eyelids import Eyes, puppet_eyes, read_eyes
 from facediff.errors import FaceDiffError
 from facediff.synthetic.head.parts import build_head
 

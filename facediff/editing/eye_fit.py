@@ -10,7 +10,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.editing.correspondence import LIDS_AT_REST, Correspondence
 from facediff.editing.face_features import Features, FrontView
-from facediff.editing.lids import LidEdges, eyeball_depth, eyeball_triangles, lid_edges
+from facediff.editing.lid_transfer import LidEdges, eyeball_depth, eyeball_triangles, lid_edges
 from facediff.editing.surface import Surface
 
 Array = npt.NDArray[np.float64]

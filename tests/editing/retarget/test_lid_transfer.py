@@ -8,7 +8,7 @@ import trimesh
 
 from facediff.animation import Animation
 from facediff.editing.face_features import Features, find_features
-from facediff.editing.lids import EyeLids, eye_lids, eyeball_depth, lid_edges, swing, with_lids, without_lids
+from facediff.editing.lid_transfer import EyeLids, eye_lids, eyeball_depth, lid_edges, swing, with_lids, without_lids
 from facediff.editing.surface import Surface
 from tests.fakes.heads import talking
 from tests.fakes.small_face import eyelid_pairs
