@@ -11,7 +11,7 @@ from facediff.animation import Animation
 from facediff.editing.correspondence import LIDS_AT_REST, Correspondence
 from facediff.editing.face_features import Features, FrontView
 from facediff.editing.lid_transfer import LidEdges, eyeball_depth, eyeball_triangles, lid_edges
-from facediff.editing.surface import Surface
+from facediff.editing.surface import Surface, triangle_normals
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -198,7 +198,7 @@ def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> tu
     inside[pictures[0][inner]] = True  # the socket; and -1, nothing, is the last one
     inside[-1] = True
     # What faces away is the inside of a lid, or of the head, that is seen past a torn one.
-    inside[:-1] |= _face_normals(posed, rest.faces)[:, 2] < 0
+    inside[:-1] |= triangle_normals(posed, rest.faces)[:, 2] < 0
     share = float(inside[pictures[1][inner]].mean())
     opening_seen = (y < top) & (y > bottom)
     columns = (inside[pictures[1]] & opening_seen).sum(axis=0)
@@ -259,9 +259,9 @@ def _forehead(
     # Edges that decimation left almost without length say nothing.
     pairs = pairs[lengths > 0.2 * np.median(lengths)]
     lengths = lengths[lengths > 0.2 * np.median(lengths)]
-    areas = np.linalg.norm(_face_normals(points, faces), axis=1)
+    areas = np.linalg.norm(triangle_normals(points, faces), axis=1)
     faces = faces[areas > 0.1 * np.median(areas)]
-    normals = _face_normals(points, faces)
+    normals = triangle_normals(points, faces)
     stretch, turned, moving = 0.0, np.zeros(len(faces), bool), np.zeros(len(faces), bool)
     for frame in frames:
         posed = np.asarray(animation.vertices[frame], np.float64)
@@ -275,11 +275,6 @@ def _forehead(
         # An edge that halves counts as one that doubles. One of 200 is ignored: scans have slivers with noisy
         # lengths.
         stretch = max(stretch, float(np.expm1(np.quantile(change, 0.995))))
-        turned |= (_face_normals(posed, faces) * normals).sum(axis=1) < 0
+        turned |= (triangle_normals(posed, faces) * normals).sum(axis=1) < 0
         moving |= moves[faces].any(axis=1)
     return stretch, float((turned & moving).sum() / max(int(moving.sum()), 1))
-
-
-def _face_normals(points: Array, faces: Indices) -> Array:
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return np.asarray(np.cross(b - a, c - a))

@@ -11,7 +11,7 @@ from facediff.animation import Animation, metres_per_unit
 from facediff.editing.correspondence import Correspondence
 from facediff.editing.eye_fit import EyeFigures, check_eyes, fullest_blink, raised_brows
 from facediff.editing.lid_transfer import lid_edges
-from facediff.editing.surface import Surface, nearest
+from facediff.editing.surface import Surface, nearest, triangle_normals
 from facediff.errors import OptionError
 
 Array = npt.NDArray[np.float64]
@@ -235,19 +235,14 @@ def _crossed(
 
 def _folded(animation: Animation, faces: npt.NDArray[np.integer], frames: npt.NDArray[np.integer]) -> float:
     """Share of the triangles that move which turn by more than a right angle in some frame."""
-    rest = _normals(np.asarray(animation.template, np.float64), faces)
+    rest = triangle_normals(np.asarray(animation.template, np.float64), faces)
     turned, moving = np.zeros(len(faces), bool), np.zeros(len(faces), bool)
     extent = float(np.ptp(animation.template, axis=0).max())
     for frame in frames:
         points = np.asarray(animation.vertices[frame], np.float64)
-        turned |= (_normals(points, faces) * rest).sum(axis=1) < 0
+        turned |= (triangle_normals(points, faces) * rest).sum(axis=1) < 0
         moving |= (np.abs(points - animation.template).max(axis=1) > 1e-4 * extent)[faces].any(axis=1)
     return float((turned & moving).sum() / max(int(moving.sum()), 1))
-
-
-def _normals(points: Array, faces: npt.NDArray[np.integer]) -> Array:
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return np.asarray(np.cross(b - a, c - a))
 
 
 def _covered(animation: Animation, correspondence: Correspondence, frames: npt.NDArray[np.integer]) -> float:

@@ -514,31 +514,29 @@ def _is_array(array: npt.NDArray[np.generic], kind: str, axes: int) -> bool:
 
 
 def _consistent(parts: Correspondence) -> bool:
-    sources, targets = len(parts.source_vertices), len(parts.target_vertices)
+    """Whether shapes and indices of all arrays match."""
+    sources, targets, followers = len(parts.source_vertices), len(parts.target_vertices), len(parts.followers)
+    shapes = {
+        **{"source_vertices": (sources, 3), "source_faces": (len(parts.source_faces), 3)},
+        **{"target_vertices": (targets, 3), "target_faces": (len(parts.target_faces), 3)},
+        **dict.fromkeys(("corners", "weights"), (targets, 3)),
+        **dict.fromkeys(("distances", "trust", "share"), (targets,)),
+        **dict.fromkeys(("follower_corners", "follower_weights"), (followers, 3)),
+    }
+    limits = {
+        **dict.fromkeys(("source_faces", "corners"), sources),
+        **dict.fromkeys(("target_faces", "followers", "follower_corners"), targets),
+        "hidden": len(parts.target_faces),
+    }
+    arrays = {name: getattr(parts, name) for name in {**shapes, **limits}}
     return (
-        parts.corners.shape == parts.weights.shape == (targets, 3)
-        and parts.distances.shape == parts.trust.shape == parts.share.shape == (targets,)
-        and parts.follower_corners.shape == parts.follower_weights.shape == (len(parts.followers), 3)
+        all(arrays[name].shape == shape for name, shape in shapes.items())
+        and all(
+            arrays[name].min(initial=0) >= 0 > arrays[name].max(initial=0) - limit for name, limit in limits.items()
+        )
+        and min(len(parts.source_faces), len(parts.target_faces), targets) > 0
         and parts.lids in (LIDS_AS_ALL, LIDS_FITTED, LIDS_AT_REST)
         and parts.similarity.rotation.shape == (3, 3)
         and parts.similarity.translation.shape == (3,)
         and parts.similarity.scale > 0
-        and parts.source_vertices.shape == (sources, 3)
-        and parts.target_vertices.shape == (targets, 3)
-        and all(
-            faces.shape[1] == 3 and faces.size > 0 and faces.min() >= 0 and faces.max() < count
-            for faces, count in (
-                (parts.source_faces, sources),
-                (parts.corners, sources),
-                (parts.target_faces, targets),
-            )
-        )
-        and all(
-            not some.size or (some.min() >= 0 and some.max() < count)
-            for some, count in (
-                (parts.followers, targets),
-                (parts.follower_corners, targets),
-                (parts.hidden, len(parts.target_faces)),
-            )
-        )
     )

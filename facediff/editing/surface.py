@@ -92,6 +92,12 @@ def vertex_normals(vertices: Array, faces: Indices) -> Array:
     return np.asarray(Trimesh(vertices, faces, process=False).vertex_normals, np.float64)
 
 
+def triangle_normals(points: Array, faces: npt.NDArray[np.integer]) -> Array:
+    """Normals (F, 3) of triangles, as long as twice their areas."""
+    a, b, c = (points[faces[:, corner]] for corner in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
 def nearest(surface: Surface, points: Array, normals: Array, size: float | None = None) -> Nearest:
     """The nearest point of a surface to each point (N, 3), where normals decide between sheets.
 

@@ -332,13 +332,17 @@ def _local(glb: Glb, node: int, turns: Array) -> npt.NDArray[np.float32]:
     nodes, placed = glb.entries("nodes"), placed_nodes(glb)
     parent = next((index for index, entry in enumerate(nodes) if node in entry.get("children", [])), None)
     above = None if parent is None else placed[parent]
-    rest = node_matrix(nodes[node])
-    frame, rest = (np.eye(3) if matrix is None else _rotation(matrix[:3, :3]) for matrix in (above, rest))
+    transform = node_matrix(nodes[node])
+    frame, rest = (np.eye(3) if matrix is None else _rotation(matrix[:3, :3]) for matrix in (above, transform))
     if "matrix" in nodes[node]:  # which a node must not have where its rotation is animated
-        assert rest is not None  # noqa: S101 - for type checkers
+        assert transform is not None  # noqa: S101 - for type checkers
         del nodes[node]["matrix"]
-        scale = np.linalg.norm(rest[:3, :3], axis=0)
-        nodes[node] |= {"translation": rest[:3, 3].tolist(), "scale": scale.tolist(), "rotation": _quaternion(rest)}
+        scale = np.linalg.norm(transform[:3, :3], axis=0)
+        nodes[node] |= {
+            "translation": transform[:3, 3].tolist(),
+            "scale": scale.tolist(),
+            "rotation": _quaternion(rest),
+        }
     local = frame.T @ matrices(turns) @ frame @ rest
     quaternions = convert(np.concatenate([local[..., 0], local[..., 1]], axis=-1), "six_d", "quaternion")
     return gltf_rotations(quaternions)

@@ -88,7 +88,7 @@ def _rate(path: Path, times: Array, numbers: Sequence[int]) -> float:
     later = np.isfinite(times) & (np.diff(times, prepend=-np.inf) > 0)
     if len(times) < 2 or not later.all():
         row = f"row {numbers[int(np.argmin(later))]}" if len(times) else "the table"
-        raise FaceDiffError(f"{path}: {row} is alone, or no later than the one before it; expected times that ascend")
+        raise FaceDiffError(f"{path}: {row} is no later than the one before it, or alone; expected times that ascend")
     return rate_of(times)
 
 
