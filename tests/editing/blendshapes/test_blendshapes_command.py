@@ -162,7 +162,7 @@ def test_shapes_of_another_topology_are_carried(
         (["take.npz", "-o", "mine.csv", "--shapes", "shapes"], "mine.json: is a file that facediff did not write"),
         (["bare.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25", "--show", "a.png"], "without a mesh"),
         (["take.npz", "--write-puppet-shapes", "new"], "has no effect with animation; omit it"),
-        (["--write-puppet-shapes", "shapes"], "exists already"),
+        (["--write-puppet-shapes", "shapes"], "shapes: is not empty"),
         (["--write-puppet-shapes", "new", "--identity", "F9"], 'no speaker "F9"; known are'),
     ],
 )
