@@ -99,7 +99,7 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     for key, columns in (entry.arrays or {}).items():
         with damaged(f"{path}: {key}", "expected numbers (frames, channels)"):
             array: npt.NDArray[np.float64] = np.asarray(content[key], np.float64)
-            array = array.reshape(array.shape[-2:])
+            array = array.reshape(array.shape[-2], array.shape[-1])
         # Exact for arrays that belong to the layout alone; SMPL-X's poses have the body's joints around the jaw.
         if array.shape[1] < columns.stop or (columns.start == 0 and array.shape[1] != columns.stop):
             raise FaceDiffError(
