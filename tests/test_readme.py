@@ -19,7 +19,7 @@ FITS = [shlex.split(line, comments=True) for block in BLOCKS for line in block.s
 
 
 def test_the_two_commands_are_there() -> None:
-    assert "pip install facediff && facediff animate docs/examples/speech.wav" in README
+    assert "pip install . && facediff animate --example -o speech.html" in README
     assert 'pip install -c tools/constraints.txt -e ".[all,test]" && pytest' in README
 
 

@@ -22,7 +22,7 @@ from facediff.cli.parsing import changed, refuse_idle
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-from facediff.utils.files import holds_glb
+from facediff.utils.files import example_recording, holds_glb
 from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.option import Option
 
@@ -45,8 +45,11 @@ class BatchOptions:
 
 
 def animate(
-    speech: Annotated[list[Path], Option(metavar="SPEECH", reads=True, dash=True)],
+    speech: Annotated[
+        list[Path] | None, Option(metavar="SPEECH", reads=True, exists="file or folder", dash=True)
+    ] = None,
     *,
+    example: Annotated[bool, Option(without="speech stream")] = False,
     checkpoint: Annotated[Path | None, Option(metavar="C", reads=True)] = None,
     output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file or folder", dash=True)],
     stream: bool = False,
@@ -60,13 +63,13 @@ def animate(
     target: TargetOptions,
     files: ExportOptions,
     batch: BatchOptions,
-    place: DeviceOptions,
+    device: DeviceOptions,
     licence: LicenceOptions,
 ) -> int:
     """Animate a face with a recording of speech, with many, or with speech as it comes.
 
     For example:
-      facediff animate speech.wav -o speech.html
+      facediff animate --example -o speech.html
       facediff animate speech.wav --checkpoint demo/puppet.ckpt -o speech.mp4
       facediff animate speech.wav --checkpoint demo/puppet.ckpt --samples 3 --blinks -o speech.html
       facediff animate recordings/ --checkpoint demo/puppet.ckpt --suffix .glb -o animations/
@@ -74,6 +77,7 @@ def animate(
 
     Args:
         speech: recording: wav, flac, ogg, mp3 or a video; several or a folder for a batch; - with --stream
+        example: animate the recording that comes with facediff
         checkpoint: trained model (.ckpt), a folder of `facediff publish` or `facediff export-model`, or USER/NAME of
             the Hugging Face hub (default: the model that comes with facediff)
         output: file to write; its suffix chooses the format (see `facediff export --help`); a folder for a batch
@@ -83,30 +87,28 @@ def animate(
         yes: start without a question, however much time or memory it takes
         generation: whose face, in which style, how.
         windows: how long speech is cut.
-        recording: what needs the whole recording.
-        controls: what is changed after inference.
+        recording: options that need the whole recording.
+        controls: changes after inference.
         target: another mesh.
         files: how the files are written.
         batch: how several recordings are animated.
-        place: where the model computes.
+        device: where the model computes.
         licence: which models are refused.
-
-    Returns:
-        the exit status: 1 if a recording of a batch failed.
     """
+    speech = [example_recording()] if example else speech or []
+    if not speech:
+        raise FaceDiffError("speech: missing; give a recording, a folder of them, - with --stream, or --example")
     streamed = [str(path) for path in speech] == ["-"]
-    several = len(speech) > 1 or speech[0].is_dir()
+    is_batch = len(speech) > 1 or speech[0].is_dir()
     if streamed != stream:
         raise FaceDiffError(
             f"--stream: reads standard input; give - in place of {speech[0]} (a file needs no --stream)"
             if stream
             else "speech: - is standard input; add --stream, and send samples rather than a file"
         )
-    if not streamed and not several and not speech[0].exists():
-        raise FaceDiffError(f"{speech[0]}: no such sound file or folder of recordings")
     if stream:
         refuse_idle("is for recordings, and a stream ends by itself", max_seconds=recording.max_seconds is not None)
-    if several:
+    if is_batch:
         one = ("alignment", "transcript")
         refuse_idle("is for one recording", **{name: getattr(recording, name) is not None for name in one})
     else:
@@ -115,7 +117,7 @@ def animate(
     check_animating_source(checkpoint)
     from facediff.export import check_used
 
-    check_used(batch.suffix if several else ".npy" if stream else output.suffix, files.changed())
+    check_used(batch.suffix if is_batch else ".npy" if stream else output.suffix, files.changed())
     files = replace(files, quiet=quiet)
     if isinstance(generation.style, str):
         from facediff.cli.track import with_tracked_styles
@@ -123,14 +125,14 @@ def animate(
         words = with_tracked_styles(generation.style, checkpoint, generation.identity)
         generation = replace(generation, style=words)
     options = AnimationOptions.of(
-        generation, windows, recording, controls, target, place, licence, checkpoint=checkpoint, quiet=quiet
+        generation, windows, recording, controls, target, device, licence, checkpoint=checkpoint, quiet=quiet
     )
     if stream:
         from facediff.pipelines.stream import animate_stream
 
         animate_stream(options, output, files, rate=rate)
         return 0
-    if several:
+    if is_batch:
         from facediff.pipelines.folder import animate_folder
 
         return animate_folder(options, speech, output, export=files, **vars(batch))
@@ -141,7 +143,7 @@ def animate(
 def animate_recording(
     options: AnimationOptions, speech: Path, output: Path, files: ExportOptions, *, yes: bool
 ) -> None:
-    """Animate one recording, and say what was written."""
+    """Animate one recording, and report the files written."""
     from facediff.export import check_export
     from facediff.export.writing import seeks_weights
     from facediff.pipelines.animate import check_options, direction_for
@@ -154,15 +156,15 @@ def animate_recording(
         options = replace(options, direction=direction_for(options.direction, speech))
     check_options(options)
     check_export(output, files, options.samples, weights=may_have_weights(options.checkpoint))
-    spoken = read_recording(speech, options.max_seconds)  # before the model, which takes longer to load
-    for problem in speech_problems(spoken.speech):
+    recording = read_recording(speech, options.max_seconds)  # before the model, which takes longer to load
+    for problem in speech_problems(recording.speech):
         tell(f"note: {speech}: {problem}")
     pipeline = open_pipeline(options)
     weights = seeks_weights(output, files) and pipeline.has_weights
     check_export(output, files, options.samples, weights=weights)
-    seconds, size = pipeline.cost(spoken.speech, output, files.size)
+    seconds, size = pipeline.cost(recording.speech, output, files.size)
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
-    written, animation = pipeline.write(spoken, output, files)
+    written, animation = pipeline.write(recording, output, files)
     metadata = animation.metadata
     notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
     notes += f", licence: {metadata.get('licence', 'not stated')}"

@@ -42,6 +42,13 @@ def config_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "configs"
 
 
+def example_recording() -> Path:
+    """A synthetic recording to try the commands with; it lies in the installed package, or in a checkout's manual."""
+    package = Path(__file__).parents[1]
+    inside = package / "examples" / "speech.wav"
+    return inside if inside.is_file() else package.parent / "docs" / "examples" / "speech.wav"
+
+
 # Atomic writing.
 
 
