@@ -1,4 +1,4 @@
-"""Callbacks: what happens around training and testing."""
+"""Callbacks for training and testing."""
 
 from lightning.pytorch import Callback
 
@@ -27,8 +27,8 @@ __all__ = [
 def defaults() -> list[Callback]:
     """The callbacks of every run of the command line, for a ``Trainer`` of one's own.
 
-    They keep ``last.ckpt``, print and write the scores of a test and the files of ``predict``, and log what a run is
-    made of and the norm of the gradient.
+    They keep ``last.ckpt``, print and write the scores of a test and the files of ``predict``, and log the description
+    of a run and the norm of the gradient.
 
     Example:
         >>> Trainer(callbacks=[*facediff.callbacks.defaults(), EmaWithWarmup()])  # doctest: +SKIP

@@ -71,7 +71,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: str | os.PathLike[str], map_location: object = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read a file by the door that every checkpoint goes through; nothing in it can ask for a less safe one."""
+        """Read a file as every checkpoint is read; its content cannot ask for a less safe way."""
         if Path(path).name == TRANSFER and (weights := only_weights(Path(path))) is not None:
             return weights
         return read_checkpoint(path)
@@ -82,7 +82,7 @@ TRANSFER = ".temp.ckpt"
 
 
 def only_weights(path: Path) -> dict[str, Any] | None:
-    """What a file holds if that is tensors by name and nothing else, which names no class and no option."""
+    """The content of a file of tensors by name and nothing else, without classes or options; else None."""
     content = load_tensors(path)
     plain = isinstance(content, dict) and all(isinstance(value, torch.Tensor) for value in content.values())
     return content if plain else None
@@ -95,10 +95,10 @@ class Stopped(SystemExit):
 class LastCheckpoint(Callback):
     """Keeps ``last.ckpt`` up to date, and stops training at the end of a step when a signal asks for it.
 
-    A checkpoint is written between two steps, when the first step is complete, logged, averaged and validated, and
-    nothing of the second has happened yet. In addition to what Lightning stores it holds the states of all
-    random-number generators and the positions of the loggers. It is the first of all callbacks, whatever its place in
-    the list: the others have then finished the step before, and not begun the next.
+    A checkpoint is written between two steps, when the first step is complete, logged, averaged and validated, and the
+    second has not begun. Besides Lightning's content it holds the states of all random-number generators and the
+    positions of the loggers. The callback moves to the front of the list: the others have then finished the step
+    before, and not begun the next.
 
     A signal waits for the end of the step, where a checkpoint is written; during validation, which may be long, it
     stops training after the current batch, and validation is repeated.
@@ -127,8 +127,8 @@ class LastCheckpoint(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Become the first callback."""
-        others = [callback for callback in trainer.callbacks if callback is not self]  # type: ignore[attr-defined]
-        trainer.callbacks = [self, *others]  # type: ignore[attr-defined]
+        callbacks = [callback for callback in trainer.callbacks if callback is not self]  # type: ignore[attr-defined]
+        trainer.callbacks = [self, *callbacks]  # type: ignore[attr-defined]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock, and let signals wait."""
@@ -203,10 +203,10 @@ class LastCheckpoint(Callback):
             return trainer.global_step % self.every_n_steps == 0
         return time.monotonic() - self._saved_at >= max(self.every_seconds, self._seconds / SHARE_OF_TIME)
 
-    def save(self, trainer: Trainer, place: str) -> None:
-        """Write ``last.ckpt``; the place is ``step`` (within an epoch), ``epoch`` (at its first batch) or ``end``."""
+    def save(self, trainer: Trainer, position: str) -> None:
+        """Write ``last.ckpt`` at a ``step`` within an epoch, at the first batch of an ``epoch``, or at the ``end``."""
         started = time.monotonic()
-        self._place = place
+        self._place = position
         try:
             trainer.save_checkpoint(trainer.strategy.broadcast(str(self.path(trainer))), weights_only=False)
         finally:
@@ -283,21 +283,18 @@ class LastCheckpoint(Callback):
             if isinstance(logger, ResumableCSVLogger) and trainer.is_global_zero and rows >= 0:
                 logger.keep(rows)
         path = Path(trainer.ckpt_path) if trainer.ckpt_path else None
-        here = path is not None and path.is_file() and os.path.realpath(path) == os.path.realpath(self.path(trainer))
-        if here:
+        is_last = path is not None and path.is_file() and os.path.realpath(path) == os.path.realpath(self.path(trainer))
+        if is_last:
             self._saved_step = checkpoint["global_step"]
         for callback in trainer.checkpoint_callbacks:
             if isinstance(callback, ModelCheckpoint):
-                continue_bookkeeping(callback, checkpoint, path if here else None)
+                continue_bookkeeping(callback, checkpoint, path if is_last else None)
 
 
 def continue_bookkeeping(callback: ModelCheckpoint, checkpoint: dict[str, Any], last: Path | None) -> None:
-    """Let a callback that keeps the best models go on with those that are there.
+    """Let a callback that keeps the best models continue with the existing ones, by its state in a checkpoint.
 
-    Args:
-        callback: it is set up, and its state has not been loaded yet.
-        checkpoint: what is being loaded; the callback's state in it is changed.
-        last: the ``last.ckpt`` that is being loaded, if its run is continued in its folder.
+    ``last`` is the ``last.ckpt`` that is loaded, if its run continues in its folder.
     """
     state, folder = checkpoint.get("callbacks", {}).get(callback.state_key), str(callback.dirpath)
     if state is None:
@@ -443,7 +440,7 @@ def continue_counting(trainer: Trainer, counts: list[list[float]]) -> None:
 
 
 def agreed(trainer: Trainer, due: bool, number: int) -> tuple[bool, int]:
-    """What at least one process wants, known to all: whether to save, and the signal that has come."""
+    """The request of at least one process, known to all: whether to save, and the signal that has come."""
     if trainer.world_size == 1:
         return due, number
     request = torch.tensor([int(due), number], device=trainer.strategy.root_device)

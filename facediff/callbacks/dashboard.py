@@ -1,4 +1,4 @@
-"""What every run logs under stable names next to losses and scores; listed in docs/monitoring.md."""
+"""Values that every run logs under stable names next to losses and scores; listed in docs/monitoring.md."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PICTURE_SIZE = 320  # Pixels of a picture's sides
 
 
 class RunDescription(Callback):
-    """Logs what a run is made of, as flat entries of its config.
+    """Logs model, components, corpus and versions of a run, as flat entries of its config.
 
     Flat, so that runs are grouped and filtered by ``component/decoder`` and the like. Every logger gets them: Weights &
     Biases in the run's config, the CSV logger in ``hparams.yaml``.
@@ -86,9 +86,9 @@ def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[st
     return {
         "model": type(model).__name__,
         **{
-            f"component/{kind}": str(chosen["class_path"]).rpartition(".")[2]
+            f"component/{kind}": str(component["class_path"]).rpartition(".")[2]
             for kind in registry.COMPONENTS
-            if isinstance(chosen := model.hparams.get(kind), dict) and "class_path" in chosen
+            if isinstance(component := model.hparams.get(kind), dict) and "class_path" in component
         },
         "parameters/trainable": parameters[True],
         "parameters/frozen": parameters[False],
@@ -105,11 +105,11 @@ def describe_run(model: AnimationModel, data: SpeechMotionDataModule) -> dict[st
 
 
 def provenance_of(trainer: Trainer, model: AnimationModel, data: SpeechMotionDataModule) -> Provenance:
-    """Which training run is being scored, or predicts: seed, checkpoint, components and options."""
+    """The training run behind scores or predictions: seed, checkpoint, components and options."""
     facts = describe_run(model, data)
     path = Path(split_face(trainer.ckpt_path)[0]) if isinstance(trainer.ckpt_path, str | Path) else None
     seed, steps = (model.provenance.get(name, "") for name in ("seed", "steps"))
-    scored = {"protocol", "metrics", "unseen_identity", "score_by"}  # decide what is measured, not what is trained
+    scored = {"protocol", "metrics", "unseen_identity", "score_by"}  # options of scoring, not of training
     options = {name: value for name, value in model.hparams.items() if name not in scored}
     trained = {name: value for name, value in model.data_options.items() if name not in ("root", "num_workers")}
     return Provenance(
@@ -168,8 +168,8 @@ def gradients_by_part(module: LightningModule) -> dict[str, list[Tensor]]:
     The part is the first word in which the parameters' names differ: ``network.decoder.…`` belongs to ``decoder``, also
     where the model has parts beside its network.
     """
-    named = [(name.removeprefix("network."), p) for name, p in module.named_parameters() if p.requires_grad]
-    gradients = [(name.split("."), parameter.grad) for name, parameter in named]
+    trained = [(name.removeprefix("network."), p) for name, p in module.named_parameters() if p.requires_grad]
+    gradients = [(name.split("."), parameter.grad) for name, parameter in trained]
     shared = len(commonprefix([path[:-1] for path, _ in gradients])) if gradients else 0
     parts: dict[str, list[Tensor]] = {}
     for path, gradient in gradients:
@@ -212,15 +212,12 @@ def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, 
     A clip's noise follows from its name, so this is the motion that the test has scored. Predicting it again costs less
     than keeping the motion of every clip that might be among the worst, and lets one process show the worst of all.
     """
-    data = trainer.datamodule  # type: ignore[attr-defined]
-    if not isinstance(data, SpeechMotionDataModule):
-        raise TypeError("the model's setup accepts no other data module")
+    data: SpeechMotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
     datasets = {split: data.dataset(split) for split in {row["split"] for row in rows}}
     measured = []
     for row in rows:
         dataset = datasets[row["split"]]
-        place = [clip.name for clip in dataset.clips].index(row["clip"])
-        sample = dataset[place]
+        sample = dataset[[clip.name for clip in dataset.clips].index(row["clip"])]
         batch = dict(model.views_of_clips(collate([sample]).to(model.device)))[row["identity"]]
         with trainer.precision_plugin.forward_context():
             motion = model.generate(batch, seed=0)
@@ -253,7 +250,7 @@ def draw_errors(model: AnimationModel, clips: list[ClipErrors]) -> list[npt.NDAr
             pictures.append(renderer.render(template, colours=heat_colours(clip.errors, highest_error(clips))))
         return pictures
     except FaceDiffError as error:
-        # The scores are printed and written by now; the rest of the test's report must not fail for a picture.
+        # The scores are written by now; the rest of the test's report must not fail for a picture.
         rank_zero_warn(f"test/sequences has no error pictures: {error}")
         return [None] * len(clips)
 

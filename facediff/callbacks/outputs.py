@@ -1,4 +1,4 @@
-"""Lines for each epoch of training, what ``facediff test`` prints and writes, and the files of ``facediff predict``."""
+"""Lines for each epoch of training, the output of ``facediff test``, and the files of ``facediff predict``."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ METHOD_NAMES = {name: label.format(model="model") for name, label in METHODS.ite
 class EpochLines(Callback):
     """Prints a line after each epoch of training, where no terminal would show a progress bar.
 
-    The line has the training loss, what is monitored in validation (names that a run logs, see ``docs/monitoring.md``)
-    where that has been measured in this epoch, and the seconds since training began. It goes to standard error.
+    The line has the training loss, the monitored score of validation (names as in ``docs/monitoring.md``) if it was
+    measured in this epoch, and the seconds since training began. It goes to standard error.
     """
 
     _validated = False
@@ -63,36 +63,22 @@ class EpochLines(Callback):
 class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
-    Next to the model are scored a face that never moves, the mean face of each speaker's training clips, which does not
-    move either, and the model given another sentence's speech. Weights & Biases gets the table of sequences as
+    Next to the model are scored a still face, the mean face of each speaker's training clips, and the model with
+    another sentence's speech. The run's folder gets ``test_scores.csv``, ``test_scores_by.csv`` (the groups of
+    ``model.score_by``), ``test_sequences.csv`` (a row per clip and method), ``test_report.json`` (all of it for
+    programs, such as ``facediff benchmark``) and ``provenance.json``, the training run: its seed, components and the
+    checkpoint's SHA-256, which are also in every row of the scores. Weights & Biases gets the table of sequences as
     ``test/sequences``, with sound and a picture of the errors for the worst clips, and the protocol's definition in the
-    run's config. Which training run is scored (its seed, the checkpoint's SHA-256, the components) stands in every row
-    of the scores, and in ``provenance.json``.
+    run's config.
 
     Args:
-        file: name of the CSV file in the run's folder; None writes none.
-        groups_file: name of the CSV file with the scores by ``model.score_by``; None writes none.
-        sequences_file: name of the CSV file with one row per clip and method; None writes none.
         media_clips: how many clips get sound and picture, the worst by LVE of all processes. They are predicted once
             more, by the first process alone, one at a time; nothing is kept in memory during the test.
-        report_file: name of the JSON file with all of it for programs, such as ``facediff benchmark``: scores,
-            sequences, what each column means, and the training run; None writes none.
     """
 
     @checks_arguments
-    def __init__(
-        self,
-        file: str | None = "test_scores.csv",
-        sequences_file: str | None = "test_sequences.csv",
-        media_clips: Annotated[int, Range(0, 10_000)] = 8,
-        groups_file: str | None = "test_scores_by.csv",
-        report_file: str | None = "test_report.json",
-    ) -> None:
-        self.file = file
-        self.report_file = report_file
-        self.sequences_file = sequences_file
+    def __init__(self, media_clips: Annotated[int, Range(0, 10_000)] = 8) -> None:
         self.media_clips = media_clips
-        self.groups_file = groups_file
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print and write; runs before the model logs and empties its metrics."""
@@ -106,19 +92,14 @@ class ScoreTable(Callback):
         if not trainer.is_global_zero:
             return
         assets = pl_module.assets
-        chosen = list(evaluation.requests)
-        print(describe_scores(rows, assets.corpus, synthetic=assets.synthetic, metrics=chosen))
+        metrics = list(evaluation.requests)
+        print(describe_scores(rows, assets.corpus, synthetic=assets.synthetic, metrics=metrics))
         if groups:
             print(describe_groups(groups, evaluation.score_by))
         print(evaluation.describe())
-        if groups and self.groups_file and folder:
-            write_rows(Path(folder) / self.groups_file, groups)
-            print(f"written: {Path(folder) / self.groups_file}")
-        provenance = None
-        if folder and (self.file or self.report_file):
+        if folder:
             provenance = provenance_of(trainer, pl_module, trainer.datamodule)  # type: ignore[attr-defined]
             provenance.write(Path(folder))
-        if self.file and folder and provenance is not None:
             # Regions become the columns <region>_vertices and <region>_hash.
             flat = []
             for row in rows:
@@ -126,13 +107,12 @@ class ScoreTable(Callback):
                 for part, region in row["regions"].items():
                     line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
                 flat.append(line | provenance.columns())
-            write_rows(Path(folder) / self.file, flat)
-            print(f"written: {Path(folder) / self.file}")
-        if self.sequences_file and folder:
-            write_rows(Path(folder) / self.sequences_file, sequences)
-            print(f"written: {Path(folder) / self.sequences_file}")
-        if self.report_file and folder and provenance is not None:
-            everything = {
+            tables = {"test_scores_by.csv": groups, "test_scores.csv": flat, "test_sequences.csv": sequences}
+            for name, table in tables.items():
+                if table:
+                    write_rows(Path(folder) / name, table)
+                    print(f"written: {Path(folder) / name}")
+            report = {
                 "format": 1,
                 "provenance": provenance.as_dict(),
                 "synthetic": assets.synthetic,
@@ -141,7 +121,7 @@ class ScoreTable(Callback):
                 "scores": rows,
                 "sequences": sequences,
             }
-            write_json(Path(folder) / self.report_file, everything)
+            write_json(Path(folder) / "test_report.json", report)
         sys.stdout.flush()
         loggers = [logger for logger in trainer.loggers if isinstance(logger, WandbLogger)]
         if loggers:
@@ -154,25 +134,25 @@ class ScoreTable(Callback):
 def log_sequences(
     logger: WandbLogger, sequences: list[dict[str, Any]], definition: str, media: dict[tuple[str, str, str], list[Any]]
 ) -> None:
-    """Give Weights & Biases the table of sequences, a row per clip and method, and the words that define its numbers.
+    """Give Weights & Biases the table of sequences, a row per clip and method, and the protocol's definition.
 
     Media are sound and picture by split, clip and identity; the model's rows that have them come first, in this order.
     """
     columns = list(sequences[0])
-    places = {key: place for place, key in enumerate(media)}
+    ranks = {key: rank for rank, key in enumerate(media)}
     data: list[tuple[int, list[Any]]] = []
     for row in sequences:
         key = (row["split"], row["clip"], row["identity"])
-        shown = row["method"] == "model" and key in media
-        values = [*(row[name] for name in columns), *(media[key] if shown else (None, None))]
-        data.append((places[key] if shown else len(places), values))
-    data.sort(key=lambda entry: entry[0])  # stable: all others stay in their order
+        with_media = row["method"] == "model" and key in media
+        values = [*(row[name] for name in columns), *(media[key] if with_media else (None, None))]
+        data.append((ranks[key] if with_media else len(ranks), values))
+    data.sort(key=lambda entry: entry[0])  # stable: rows without media keep their order
     logger.log_table("test/sequences", columns=[*columns, "audio", "error"], data=[values for _, values in data])
     logger.experiment.config.update({"protocol_definition": definition}, allow_val_change=True)
 
 
 def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool, metrics: Sequence[str] = ()) -> str:
-    """The scores as text, one row per split and method, with what they were taken over."""
+    """The scores as text, one row per split and method, with regions, frames and clips."""
     names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
     kind = "SYNTHETIC corpus" if synthetic else "corpus"
     lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen speakers: {rows[0]['unseen_identity']}"]
@@ -250,7 +230,7 @@ class PredictionWriter(BasePredictionWriter):
                 np.save(temporary, clip.vertices.flatten(1).numpy())
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say which training run the files are of, and print where they are."""
+        """Write the training run of the files next to them, and print their folder."""
         if trainer.is_global_zero and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             data = trainer.datamodule  # type: ignore[attr-defined]
             if isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):

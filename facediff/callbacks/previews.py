@@ -1,4 +1,4 @@
-"""Pictures and videos of what a model can do so far, while it trains.
+"""Pictures and videos of a model's motion while it trains.
 
 From top to bottom: when the callback draws and with which weights; how one clip is generated and drawn; how the loggers
 show it.
@@ -29,7 +29,7 @@ from torch import Tensor
 
 from facediff import registry
 from facediff.callbacks.dashboard import lip_error
-from facediff.callbacks.runs import run_folder
+from facediff.callbacks.runs import require_facediff, run_folder
 from facediff.data import Sample, SpeechMotionDataModule, collate
 from facediff.data.corpus import Clip
 from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
@@ -53,9 +53,9 @@ ASPECT = 0.75
 class SamplingPreview(Callback):
     """Draws the same few validation clips again and again: truth, prediction and error heat map, with sound.
 
-    Where a callback averages weights (EMA), the averaged weights are what is drawn. Files appear in the run's folder as
+    Where a callback averages weights (EMA), the averaged weights are drawn. Files appear in the run's folder as
     ``previews/epoch_0020/<clip>.mp4`` and ``.png``; Weights & Biases gets the videos and the table ``preview/clips``,
-    TensorBoard a sheet of pictures and the sound; ``preview/seconds`` is the time that it took. One process draws.
+    TensorBoard a sheet of pictures and the sound; ``preview/seconds`` is the drawing time. One process draws.
     Training is the same, digit for digit, with and without; a preview that fails is a warning. Where there are several
     of these callbacks, the last one counts, so that a config given later replaces the options.
 
@@ -134,20 +134,19 @@ class SamplingPreview(Callback):
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Choose the clips, or report why there will be no preview."""
         data = trainer.datamodule  # type: ignore[attr-defined]
-        if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
-            raise FaceDiffError("SamplingPreview works with facediff's models and data modules only")
+        model = require_facediff(self, pl_module, data)
         self._chosen = []
         if [callback for callback in trainer.callbacks if type(callback) is type(self)][-1] is not self:  # type: ignore[attr-defined]
             return
         clips = data.clips("val")
-        missing = [name for name in self.names or [] if name not in {clip.name for clip in clips}]
-        if missing:
-            raise FaceDiffError(f"SamplingPreview: {missing[0]} is no validation clip of {data.root}; see data.clips")
+        unknown = [name for name in self.names or [] if name not in {clip.name for clip in clips}]
+        if unknown:
+            raise FaceDiffError(f"SamplingPreview: {unknown[0]} is no validation clip of {data.root}; see data.clips")
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         # DeepSpeed's strategy is a DDPStrategy, but spreads the weights over processes like FSDP.
         sharded = isinstance(trainer.strategy, DeepSpeedStrategy) or not isinstance(trainer.strategy, DDPStrategy)
-        if pl_module.assets.scored.faces is None:
+        if model.assets.scored.faces is None:
             if trainer.is_global_zero:  # no fault: the bundled configs ask for previews, whatever the corpus has
                 files = " or ".join(data.mesh_files) or "its class names no mesh_files"
                 print(f"no previews in this run: {data.root} holds no mesh to draw ({files})", flush=True)
@@ -192,29 +191,29 @@ class SamplingPreview(Callback):
             return
         start = time.perf_counter()
         self._drawn_epochs, self._drawn_step = epochs, trainer.global_step
-        drawn: list[ClipPreview] = []
-        # What fails is caught inside, since the random state would not be put back after an error.
+        previews: list[ClipPreview] = []
+        # Errors are caught inside, since the random state would not be put back after one.
         with isolate_rng(), self._surviving(f"after epoch {epochs}"), weights:
             folder = run_folder(trainer) / "previews" / f"epoch_{epochs:04d}"
             # The first seconds of the clips, read from disk without a loader.
             data: SpeechMotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
             dataset = data.dataset("val")
             dataset.window = max(1, round(self.seconds * data.frame_rate))
-            places = {clip.name: place for place, clip in enumerate(dataset.clips)}
-            samples = [dataset[places[name]] for name in self._chosen]
+            indices = {clip.name: index for index, clip in enumerate(dataset.clips)}
+            samples = [dataset[indices[name]] for name in self._chosen]
             self._scale = self._scale or default_error_scale(samples)
             for sample in samples:
                 if not self._chosen:
-                    break  # a package is missing, of which a warning has been given
+                    break  # a package is missing, and a warning has been given
                 with self._surviving(f"of {sample.name} after epoch {epochs}"):
-                    drawn.append(self._clip(trainer, cast(AnimationModel, model), sample, folder, epochs))
-            for logger in trainer.loggers if drawn else []:
+                    previews.append(self._clip(trainer, cast(AnimationModel, model), sample, folder, epochs))
+            for logger in trainer.loggers if previews else []:
                 with self._surviving(f"after epoch {epochs} for {type(logger).__name__}"):
-                    show(logger, drawn, epochs, trainer.global_step, self._tables)
+                    show(logger, previews, epochs, trainer.global_step, self._tables)
                     seconds = time.perf_counter() - start
                     logger.log_metrics({"preview/seconds": seconds}, step=trainer.global_step)
-            if drawn:
-                names, seconds = ", ".join(clip.name for clip in drawn), time.perf_counter() - start
+            if previews:
+                names, seconds = ", ".join(clip.name for clip in previews), time.perf_counter() - start
                 print(f"preview after epoch {epochs}: {names} in {seconds:.1f} s, written to {folder}", flush=True)
 
     def _clip(self, trainer: Trainer, model: AnimationModel, sample: Sample, folder: Path, epochs: int) -> ClipPreview:
@@ -244,7 +243,7 @@ class SamplingPreview(Callback):
 
 @contextmanager
 def averaged_weights(trainer: Trainer, model: LightningModule) -> Iterator[None]:
-    """A context with the weights in the model that a checkpoint would hold; its own are put back afterwards."""
+    """A context with the weights of a checkpoint in the model; its own are put back afterwards."""
     # At the end of training, callbacks before the averaging one see the raw weights and later ones the averaged. Saved
     # as into a checkpoint, the averaged ones are obtained in any order.
     averaging = next((callback for callback in trainer.callbacks if isinstance(callback, WeightAveraging)), None)  # type: ignore[attr-defined]
@@ -252,13 +251,13 @@ def averaged_weights(trainer: Trainer, model: LightningModule) -> Iterator[None]
     if averaging is not None:
         averaging.on_save_checkpoint(trainer, model, checkpoint)
     averaged: dict[str, Tensor] = checkpoint["state_dict"]
-    own = {name: tensor for name, tensor in model.state_dict().items() if name in averaged}
-    kept = {name: tensor.clone() for name, tensor in own.items()}
+    weights = {name: tensor for name, tensor in model.state_dict().items() if name in averaged}
+    copies = {name: tensor.clone() for name, tensor in weights.items()}
     try:
-        copy_weights(averaged, own)
+        copy_weights(averaged, weights)
         yield
     finally:
-        copy_weights(kept, own)
+        copy_weights(copies, weights)
 
 
 @torch.no_grad()
@@ -275,7 +274,7 @@ def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> I
     model.eval()
     try:
         with model.choosing():
-            # Of a method that samples in its own way, previews show that.
+            # Methods with their own way of sampling keep it.
             if (sampler is not None or steps is not None) and model.has_sampler(sampler):
                 model.choose_sampler(sampler, steps)
             yield
@@ -287,11 +286,11 @@ def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> I
 def first_of_each_identity(clips: Sequence[Clip], count: int) -> list[str]:
     """Names of ``count`` clips (fewer if there are no more): each identity's first, then each one's second …."""
     rounds: dict[str, int] = {}
-    placed = []
-    for place, clip in enumerate(clips):
+    order = []
+    for index, clip in enumerate(clips):
         rounds[clip.identity] = rounds.get(clip.identity, 0) + 1
-        placed.append((rounds[clip.identity], place, clip.name))
-    return [name for _, _, name in sorted(placed)[:count]]
+        order.append((rounds[clip.identity], index, clip.name))
+    return [name for _, _, name in sorted(order)[:count]]
 
 
 def default_error_scale(samples: Sequence[Sample]) -> float:
@@ -307,7 +306,7 @@ def default_error_scale(samples: Sequence[Sample]) -> float:
 
 @dataclass(frozen=True)
 class ClipPreview:
-    """What was drawn of a clip."""
+    """The drawing of a clip."""
 
     name: str
     video: Path
@@ -333,15 +332,13 @@ def draw_clip(
     ``size`` and ``view`` are those of :class:`SamplingPreview`.
     """
     assets, name = model.assets.scored, sample.identity_name
-    if assets.faces is None:
-        raise FaceDiffError(f"{assets.corpus} has no mesh to draw")
     clip_scores = scores(model, sample, motion)
     corpus = f"{assets.corpus}, synthetic corpus" if assets.synthetic else assets.corpus
     template, width = assets.template(name).numpy(), round(ASPECT * size)
     truth, motion = (model.assets.to_scored(offsets, name) for offsets in (sample.motion, motion))
     framed = portrait(template, {name: indices.numpy() for name, indices in assets.regions.items()})
     renderer = Renderer(
-        assets.faces.numpy(),
+        cast(Tensor, assets.faces).numpy(),
         template=template,
         size=(size, width),
         camera=Camera.framing(framed, view=view, aspect=width / size),
@@ -362,9 +359,9 @@ def draw_clip(
 
     def remembering(frames: Iterable[Picture]) -> Iterator[Picture]:
         # The video is written while it is drawn; the sheet's frames are kept on the way.
-        for place, frame in enumerate(frames):
-            if place in picks:
-                picked[place] = frame
+        for index, frame in enumerate(frames):
+            if index in picks:
+                picked[index] = frame
             yield frame
 
     sound = fit_length(sample.audio.numpy(), samples_for(count, rate))
@@ -381,14 +378,14 @@ def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, f
     evaluation, truth = model.evaluation, sample.motion
     if not evaluation.protocol.channels:
         truth, motion = (model.assets.to_scored(offsets, sample.identity_name) for offsets in (truth, motion))
-    own = evaluation.metrics["val"]["model"].clone().to(motion.device)
-    metrics = cast(Iterable[tuple[str, SequenceMetric]], own.items(copy_state=False))
+    collection = evaluation.metrics["val"]["model"].clone().to(motion.device)
+    metrics = cast(Iterable[tuple[str, SequenceMetric]], collection.items(copy_state=False))
     (clip,) = align(motion[None], truth[None], clip_names=[sample.name]).clips
     return {name: float(metric.clip_value(clip)) for name, metric in metrics}
 
 
 def lip_score(clip_scores: dict[str, float]) -> str:
-    """The error of the lips, or what stands for it, with its name."""
+    """The error of the lips, or of all vertices, with its name."""
     title = lip_error(clip_scores)
     return f"{title.upper()} {clip_scores[title]:.3g}"
 
@@ -419,5 +416,5 @@ def show(logger: Logger, clips: Sequence[ClipPreview], epochs: int, step: int, t
         table = tables.setdefault(id(logger), wandb.Table(columns=columns, log_mode="INCREMENTAL"))
         for clip in clips:
             table.add_data(clip.name, epochs, video(clip), *clip.scores.values())
-        shown: dict[str, Any] = {f"preview/{clip.name}": video(clip) for clip in clips}
-        logger.log_metrics({**shown, "preview/clips": table}, step)
+        videos: dict[str, Any] = {f"preview/{clip.name}": video(clip) for clip in clips}
+        logger.log_metrics({**videos, "preview/clips": table}, step)

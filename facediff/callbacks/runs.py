@@ -13,17 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from lightning.fabric.loggers.logger import rank_zero_experiment
-from lightning.pytorch import Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.core.saving import save_hparams_to_yaml
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 
+from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
+from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
 from facediff.utils.files import LockedError, atomic, locked, sweep
 from facediff.utils.hub import check_model_source, check_training_source, local_model
 
 STATE_KEY = "facediff_training_state"
-"""Where a checkpoint holds what Lightning does not keep."""
+"""Key of a checkpoint for the state that Lightning does not keep."""
 
 JOB_FILE = "slurm_job_id"
 """In the folder of a run that SLURM was asked to start again."""
@@ -39,6 +41,13 @@ CONFIG = "config.yaml"
 
 Entries = Sequence[Mapping[str, Any]]
 """The trainer's loggers as its options state them: ``class_path`` and ``init_args`` of each."""
+
+
+def require_facediff(callback: Callback, module: LightningModule, data: object) -> AnimationModel:
+    """The model of a callback that works with facediff's models and data modules only."""
+    if not isinstance(module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
+        raise FaceDiffError(f"{type(callback).__name__} works with facediff's models and data modules only")
+    return module
 
 
 def run_folder(trainer: Trainer) -> Path:
@@ -71,7 +80,7 @@ def runs_folder(trainer: Trainer) -> Path:
     return Path(logger.save_dir or trainer.default_root_dir) / str(logger.name or "")
 
 
-def newest_run(trainer: Trainer, entries: Entries, asked: str = "last") -> Path:
+def newest_run(trainer: Trainer, entries: Entries, word: str = "last") -> Path:
     """The run that was written to last, among those that the trainer's first logger would add one to.
 
     A run that has no ``last.ckpt`` was stopped before its first step, and begins again.
@@ -83,7 +92,7 @@ def newest_run(trainer: Trainer, entries: Entries, asked: str = "last") -> Path:
         runs = [folder] if (folder / LAST).is_file() or (logger and folder.is_dir()) else []
     if not runs:
         raise FaceDiffError(
-            f"--ckpt_path {asked}: there is no run to continue in {folder}; give the config and the options of the "
+            f"--ckpt_path {word}: there is no run to continue in {folder}; give the config and the options of the "
             f"run, or omit --ckpt_path to start one"
         )
 
@@ -93,10 +102,10 @@ def newest_run(trainer: Trainer, entries: Entries, asked: str = "last") -> Path:
     newest = max(runs, key=written)
     saved = [run for run in runs if (run / LAST).is_file()]
     if not (newest / LAST).is_file() and saved:
-        other = max(saved, key=written)
+        earlier = max(saved, key=written)
         raise FaceDiffError(
-            f"--ckpt_path {asked}: the newest run, {newest}, was stopped before its first step; give --ckpt_path "
-            f"{other / LAST} to continue the one before, or omit --ckpt_path to start again"
+            f"--ckpt_path {word}: the newest run, {newest}, was stopped before its first step; give --ckpt_path "
+            f"{earlier / LAST} to continue the one before, or omit --ckpt_path to start again"
         )
     return newest
 
@@ -106,13 +115,13 @@ def best_checkpoint(run: Path) -> Path:
     callbacks = read_checkpoint(run / LAST).get("callbacks", {}) if (run / LAST).is_file() else {}
     paths = [Path(state["best_model_path"]) for state in callbacks.values() if state.get("best_model_path")]
     # The folder may have another name by now.
-    found = [path for own in paths for path in ((run / LAST).with_name(own.name), own) if path.is_file()]
-    if not found:
+    files = [file for path in paths for file in ((run / LAST).with_name(path.name), path) if file.is_file()]
+    if not files:
         raise FaceDiffError(
             f"--ckpt_path best: {run} has none; expected a run that has validated, with a ModelCheckpoint that "
             f"monitors a score"
         )
-    return found[0]
+    return files[0]
 
 
 def _has_version(entries: Entries) -> bool:
@@ -128,33 +137,28 @@ def _began_training(config: Path) -> bool:
     return re.search(r"^(verbose|return_predictions):", config.read_text("utf-8", "replace"), re.MULTILINE) is None
 
 
-def find_scored(trainer: Trainer, entries: Entries, asked: str | None) -> Path | None:
+def find_scored(trainer: Trainer, entries: Entries, word: str | None) -> Path | None:
     """The checkpoint to score: a path, or ``last`` or ``best`` of the run that would be continued; None for none."""
-    if asked == "best":
-        return best_checkpoint(newest_run(trainer, entries, asked))
-    if asked is None or asked == "last":
-        path = None if asked is None else newest_run(trainer, entries) / LAST
-        if path is not None and not path.is_file():
-            raise FaceDiffError(f"--ckpt_path {asked}: there is no {path}; expected a .ckpt file of `facediff fit`")
-        return path
-    check_model_source(asked, "--ckpt_path")
-    return local_model(asked)
+    if word is None:
+        return None
+    if word == "best":
+        return best_checkpoint(newest_run(trainer, entries, word))
+    path = newest_run(trainer, entries) / LAST if word == "last" else word
+    check_model_source(path, "--ckpt_path")
+    return local_model(path)
 
 
-def find_checkpoint(trainer: Trainer, entries: Entries, asked: str | None) -> Path | None:
+def find_checkpoint(trainer: Trainer, entries: Entries, word: str | None) -> Path | None:
     """The checkpoint to continue from, which may not be there yet; None for a new run.
 
-    Args:
-        trainer: its loggers say where the runs are.
-        entries: the loggers' options.
-        asked: a path, ``last``, ``best``, or None; a job that SLURM has started again continues its run then.
+    ``word`` is a path, ``last``, ``best``, or None: a job that SLURM has started again continues its run then.
     """
-    if asked is not None:
-        if asked in ("last", "best"):
-            run = newest_run(trainer, entries, asked)
-            return run / LAST if asked == "last" else best_checkpoint(run)
-        check_training_source(asked)
-        return Path(asked)
+    if word is not None:
+        if word in ("last", "best"):
+            run = newest_run(trainer, entries, word)
+            return run / LAST if word == "last" else best_checkpoint(run)
+        check_training_source(word)
+        return Path(word)
     if int(os.environ.get("SLURM_RESTART_COUNT") or 0):
         job, folder = job_text(), runs_folder(trainer)
         for run in folder.glob("*") if trainer.logger else [folder]:
@@ -173,19 +177,11 @@ def continued_run(
 ) -> Path | None:
     """The folder of the run that training continues; None for a new run.
 
-    Training that begins from any other file than a ``last.ckpt``, or with a place for its run on the command line, is
-    a new run.
-
-    Args:
-        trainer: with loggers that have not been used yet.
-        entries: the loggers' options.
-        path: the checkpoint that training begins from.
-        content: what is in it; empty if it is not there.
-        arguments: the command line.
+    Training from any other file than a ``last.ckpt``, or with another folder on the command line, is a new run.
     """
     run = None if path is None or trainer.logger is None else run_of(path)
-    place = re.compile(r"--name\b|--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
-    if run is not None and any(place.match(word) for word in arguments):
+    folder_option = re.compile(r"--name\b|--trainer\.logger\.(init_args\.)?(save_dir|name|version)\b")
+    if run is not None and any(folder_option.match(word) for word in arguments):
         one = _has_version(entries)
         stated, present = (run_folder(trainer), run) if one else (runs_folder(trainer), run.parent)
         run = run if os.path.realpath(present) == os.path.realpath(stated) else None
@@ -200,12 +196,7 @@ def entered_run(
 ) -> Iterator[None]:
     """Give the trainer the loggers of a run, and keep a second ``fit`` out of the run's folder while the block runs.
 
-    Args:
-        trainer: with loggers that have not been used yet.
-        entries: the loggers' options.
-        run: the folder of the run that is continued; None for a new run. Where another process has just taken the
-            number that its loggers would take, it gets the next.
-        content: the checkpoint that is continued from.
+    A new run gets the next number where another process has just taken the one that its loggers would take.
     """
     checkpoints = trainer.checkpoint_callbacks
     numbered = run is None and isinstance(trainer.logger, CSVLogger | TensorBoardLogger) and not _has_version(entries)
@@ -220,7 +211,7 @@ def entered_run(
                         continue  # new loggers look for a free number again
                     raise
                 for earlier in run_folder(trainer).parent.glob("*/checkpoints"):
-                    sweep(earlier)  # what a run left that was killed in its first save, which nobody continues
+                    sweep(earlier)  # leftovers of a run that was killed in its first save
             yield
             return
 
@@ -231,50 +222,44 @@ def entered_run(
 def run_loggers(
     loggers: Sequence[Logger], entries: Entries, run: Path | None = None, content: Mapping[str, Any] | None = None
 ) -> list[Logger]:
-    """The loggers that options state, such that they continue what they have logged.
+    """The loggers of the options, such that they continue the logs of a run by a checkpoint's content.
 
-    Args:
-        loggers: the trainer's.
-        entries: their options; loggers without any stay as they are.
-        run: the folder of the run that is continued; None for a new run.
-        content: the checkpoint; it says what :func:`logger_versions` was, and the optimiser steps that had been taken:
-            TensorBoard hides what it was shown of later ones.
+    TensorBoard hides the values of later steps than the checkpoint's.
     """
     versions = (content or {}).get(STATE_KEY, {}).get("versions", ())
-    ready: list[Logger] = []
-    for place, logger in enumerate(loggers):
-        entry = entries[place] if place < len(entries) else {}
+    resumed: list[Logger] = []
+    for index, logger in enumerate(loggers):
+        entry = entries[index] if index < len(entries) else {}
         options = {**(entry.get("init_args") or {}), **(entry.get("dict_kwargs") or {})}
-        version = versions[place] if place < len(versions) and run is not None else None
-        if run is not None and place == 0:
+        version = versions[index] if index < len(versions) and run is not None else None
+        if run is not None and index == 0:
             version = version or run.name
             if isinstance(logger, CSVLogger | TensorBoardLogger):
                 options |= {"save_dir": str(run.parent), "name": ""}
                 version = run.name
-        made = logger
         if isinstance(logger, CSVLogger) and entry:
-            made = ResumableCSVLogger(**{**options, **({} if version is None else {"version": version})})
-            made.continues = version is not None
+            logger = ResumableCSVLogger(**{**options, **({} if version is None else {"version": version})})  # noqa: PLW2901
+            logger.continues = version is not None
         elif isinstance(logger, TensorBoardLogger) and entry:
             # A second logger would find the folder that the first has made, and take the next number.
             first = entries[0].get("init_args") or {}
-            shared = place and all(first.get(name) == options.get(name) for name in ("save_dir", "name"))
+            shared = index and all(first.get(name) == options.get(name) for name in ("save_dir", "name"))
             if version is None and shared and options.get("version") is None:
-                version = ready[0].version
+                version = resumed[0].version
             options |= {} if version is None else {"version": version}
             options |= {} if run is None else {"purge_step": (content or {}).get("global_step", 0)}
-            made = TensorBoardLogger(**options)
-        elif isinstance(logger, WandbLogger) and entry and (run is not None or place == 0):
+            logger = TensorBoardLogger(**options)  # noqa: PLW2901
+        elif isinstance(logger, WandbLogger) and entry and (run is not None or index == 0):
             # The folder is known from now on, and not once wandb uploads.
             stated = options.get("version") or options.get("id") or os.environ.get("WANDB_RUN_ID")
             options["version"] = version if run is not None else stated or secrets.token_hex(4)
-            made = WandbLogger(**options)
-        ready.append(made)
-    return ready
+            logger = WandbLogger(**options)  # noqa: PLW2901
+        resumed.append(logger)
+    return resumed
 
 
 def logger_versions(trainer: Trainer) -> list[Any]:
-    """What tells the runs of each logger apart: a number, a name, an identifier of Weights & Biases."""
+    """The version of each logger's run: a number, a name, an identifier of Weights & Biases."""
     return [logger.version if isinstance(logger.version, int | str) else None for logger in trainer.loggers]
 
 
@@ -292,7 +277,7 @@ class ResumableCSVLogger(CSVLogger):
     table: MetricsFile | None = None
 
     def rows(self) -> int:
-        """Rows written so far; whatever is pending is written first."""
+        """Rows written so far; pending ones are written first."""
         self.save()
         table = self.experiment
         return len(read_rows(table.path)[1]) if table.columns and table.path.is_file() else 0
@@ -315,7 +300,7 @@ class ResumableCSVLogger(CSVLogger):
         return self.table
 
     def finalize(self, status: str) -> None:
-        """Write what is pending."""
+        """Write pending rows."""
         if self.table is not None:
             self.save()
 

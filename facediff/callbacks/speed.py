@@ -10,10 +10,9 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import nn
 
-from facediff.data import SpeechMotionDataModule
+from facediff.callbacks.runs import require_facediff
 from facediff.data.dataset import CachedFeatures
 from facediff.errors import FaceDiffError
-from facediff.models import AnimationModel
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.hints import checks_arguments
@@ -28,7 +27,7 @@ class SpeechFeatureCache(Callback):
 
     The files are keyed by the frozen weights, the number of frozen layers, the precision and the speech itself, so a
     changed encoder or a changed recording never gets old features. Training on whole clips gives the same losses as
-    without. Training on windows differs a little: the frozen part then hears the whole clip, not the window alone.
+    without. Training on windows differs a little: the frozen part then encodes the entire clip, not the window.
 
     Args:
         folder: where the features are kept; ``speech_features`` in the user's cache folder if None.
@@ -42,29 +41,24 @@ class SpeechFeatureCache(Callback):
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Encode the clips that have no features yet, each process its share, and let the data module read all."""
         data = trainer.datamodule  # type: ignore[attr-defined]
-        if not isinstance(pl_module, AnimationModel) or not isinstance(data, SpeechMotionDataModule):
-            raise FaceDiffError("SpeechFeatureCache works with facediff's models and data modules only")
-        if not pl_module.hears_whole_clips:
-            raise FaceDiffError(
-                f"SpeechFeatureCache: {type(pl_module).__name__} encodes pieces of the speech that are cut anew in "
-                f"each step, so that there is nothing to keep; omit the callback"
-            )
-        encoder = pl_module.speech_encoder
-        key = encoder.frozen_key()
+        model = require_facediff(self, pl_module, data)
+        encoder = model.speech_encoder
+        key = encoder.frozen_key() if model.hears_whole_clips else None
         if key is None:
             raise FaceDiffError(
-                f"SpeechFeatureCache: the audio encoder {type(encoder).__name__} has no frozen part to keep (or "
-                f"spec_augment is on); omit the callback, or use one that has, e.g. --model.audio_encoder=hubert"
+                f"SpeechFeatureCache: {type(model).__name__} encodes random pieces of the speech, or its audio encoder "
+                f"{type(encoder).__name__} has no frozen part (or spec_augment is on); omit the callback, or use an "
+                f"encoder with one, e.g. --model.audio_encoder=hubert"
             )
         features = CachedFeatures(ArrayStore(self.folder), f"{key}:{trainer.precision}")
         clips = [*data.clips("train"), *data.clips("val")]
         rank, world = trainer.global_rank, trainer.world_size
-        shown = track(clips, "speech features", shown=rank == 0 and trainer.progress_bar_callback is not None)
-        for place, clip in enumerate(shown):
+        progress = track(clips, "speech features", shown=rank == 0 and trainer.progress_bar_callback is not None)
+        for index, clip in enumerate(progress):
             audio = features.add(data.corpus, clip)
-            if audio is None or place % world != rank:
+            if audio is None or index % world != rank:
                 continue
-            batch = audio[None].to(pl_module.device)
+            batch = audio[None].to(model.device)
             with trainer.precision_plugin.forward_context():
                 encoded, lengths = encoder.frozen_features(batch, torch.tensor([audio.numel()], device=batch.device))
             features.put(clip, encoded[0, : int(lengths[0])])
@@ -93,18 +87,14 @@ class CompiledTraining(Callback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Find the parts."""
-        network = getattr(pl_module, "network", None)
-        if not isinstance(network, nn.Module):
-            raise FaceDiffError(
-                f"CompiledTraining: {type(pl_module).__name__} has no network whose parts could be compiled; omit "
-                f"the callback"
-            )
+        network = getattr(pl_module, "network", None) or nn.Module()
         modules = dict(network.named_modules())
         for name in self.parts:
             if name not in modules or not name:
-                there = ", ".join(child for child, _ in network.named_children())
+                children = ", ".join(child for child, _ in network.named_children()) or "none"
                 raise FaceDiffError(
-                    f'CompiledTraining.parts: the network has no part "{name}"; choose among {there}, or parts of these'
+                    f'CompiledTraining.parts: {type(pl_module).__name__} has no part "{name}" in its network; its '
+                    f"parts are {children}"
                 )
         self._compiled = [modules[name] for name in self.parts]
 

@@ -11,10 +11,7 @@ from pathlib import Path
 import lightning.pytorch as pl
 import pytest
 
-from facediff.callbacks import CompiledTraining
-from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
-from tests.fakes.tiny import Tiny
 
 MakeModel = Callable[..., DualPathDiffusion]
 MakeTrainer = Callable[..., pl.Trainer]
@@ -81,11 +78,3 @@ def test_compiled_training_gives_the_same_losses_weights_and_names(tiny_root: Pa
     assert found[1] == pytest.approx(plain[1], rel=1e-3, abs=1e-2)
     assert found[2] == []
     assert late == [[]]
-
-
-def test_compiled_training_names_a_part_that_does_not_exist(
-    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny
-) -> None:
-    trainer = make_trainer(callbacks=[CompiledTraining(parts=["decoders"])])
-    with pytest.raises(FaceDiffError, match=r'no part "decoders"; choose among .*fusion, .*decoder'):
-        trainer.fit(make_model(), datamodule=tiny)

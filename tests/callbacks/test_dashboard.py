@@ -176,7 +176,7 @@ def tested(
     monkeypatch.setenv("WANDB_DATA_DIR", str(tmp_path / "data"))
     wandb.finish()  # another test's run in this process
     model = make_model(motion_scale="none")
-    table = ScoreTable(file=None, sequences_file=None, media_clips=3)
+    table = ScoreTable(media_clips=3)
     trainer = make_trainer(logger=WandbLogger(save_dir=tmp_path), callbacks=[table, RunDescription()])
     trainer.test(model, datamodule=Tiny(root=str(tiny_root), batch_size=3), verbose=False)
     wandb.finish()
