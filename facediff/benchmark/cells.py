@@ -1,4 +1,4 @@
-"""The cells of a plan: every row on every corpus with every seed, and what decides the result of each.
+"""The cells of a plan: every row on every corpus with every seed, and the recipe of each.
 
 Two cells whose recipes are equal have equal results, so the recipe's hash is the cell's name on the disk. A changed
 plan, a changed config that it names, a changed checkpoint or a changed corpus thus makes new cells of those that it
@@ -12,21 +12,22 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
 from facediff.benchmark.plan import (
     MEAN_SUFFIX,
-    MOST_CELLS,
     Before,
     BenchmarkPlan,
     CorpusEntry,
     MethodEntry,
     Options,
     Variant,
+    check_names,
     find_config,
 )
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError
 from facediff.utils.checksums import describe_files, sha256
 from facediff.utils.files import short_name
 from facediff.utils.hub import check_model_source, model_hash
@@ -65,8 +66,8 @@ class Cell:
         test_options: of ``facediff test``.
         root: the corpus's folder where the plan names it.
         data: config of the data module where the plan names it.
-        recipe: all that decides the result, as plain data.
-        trained: the part of the recipe that decides the trained weights.
+        recipe: everything that the result depends on, as plain data.
+        trained: the part of the recipe that the trained weights depend on.
     """
 
     row: str
@@ -87,7 +88,7 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Hash of all that decides the result."""
+        """Hash of the recipe."""
         return hash_of(self.recipe)
 
     @property
@@ -129,48 +130,34 @@ class Row:
 def rows_of(plan: BenchmarkPlan) -> list[Row]:
     """The rows of a plan, in its order; where there are variants, each method once for each of them."""
     rows: list[Row] = []
-    # Where one method alone is trained, its variants are the rows, and their names say enough.
-    alone = sum(method.config is not None for method in plan.methods.values()) == 1
+    # The variants of the only method that is trained are rows under their own names.
+    single = sum(method.config is not None for method in plan.methods.values()) == 1
     for method in plan.methods.values():
         names = list(plan.variants) if method.variants is None else list(method.variants)
-        if method.config is None or not names:  # what is trained already has no variants
+        if method.config is None or not names:  # a trained model has no variants
             rows.append(Row(method.name, method.label, method))
             continue
         for name in names:
             variant = plan.variants[name]
-            label = variant.label if alone else f"{method.label}, {variant.label}"
-            rows.append(Row(name if alone else f"{method.name}/{name}", label, method, variant))
+            label = variant.label if single else f"{method.label}, {variant.label}"
+            rows.append(Row(name if single else f"{method.name}/{name}", label, method, variant))
     names = [row.name for row in rows]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise FaceDiffError(f"{plan.file}: two rows are called {twice!r}; give the method or the variant another name")
-    if plan.baseline and plan.baseline.removesuffix(MEAN_SUFFIX) not in names:
-        raise FaceDiffError(
-            f"{plan.file}: baseline: there is no row {plan.baseline!r}: {choices(plan.baseline, names)}"
-        )
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise FaceDiffError(f"{plan.file}: {repeated} names two rows; rename the method or the variant")
+    check_names(f"{plan.file}: baseline", "row", filter(None, [plan.baseline.removesuffix(MEAN_SUFFIX)]), names)
     return rows
 
 
 def cells_of(plan: BenchmarkPlan) -> list[Cell]:
-    """All cells, seed by seed, so that a plan that is stopped early has whole columns of few seeds."""
-    pairs = [
-        (row, corpus)
+    """All cells, seed by seed, so that a plan that is stopped early has complete columns of few seeds."""
+    columns = [
+        list(_cells(plan, row, corpus))
         for row in rows_of(plan)
         for name, corpus in plan.corpora.items()
         if row.method.corpora is None or name in row.method.corpora
     ]
-    count = sum(len(row.method.seeds or plan.seeds) or 1 for row, _ in pairs)
-    if not 1 <= count <= MOST_CELLS:
-        raise FaceDiffError(f"{plan.file}: has {count} cells (methods × corpora × seeds); expected 1 to {MOST_CELLS}")
-    cells = [cell for row, corpus in pairs for cell in _cells(plan, row, corpus)]
-    places: dict[tuple[str, str], int] = {}
-
-    def turn(cell: Cell) -> int:
-        place = places.get((cell.row, cell.corpus), 0)
-        places[cell.row, cell.corpus] = place + 1
-        return place
-
-    return sorted(cells, key=turn)
+    return [cell for turn in zip_longest(*columns) for cell in turn if cell is not None]
 
 
 def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
@@ -196,8 +183,8 @@ def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]
     text = method.checkpoint or method.predictions or ""
     if kind == "predictions" and corpus.data is None:
         raise FaceDiffError(
-            f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name "
-            f"its config, such as configs/data/biwi.yaml, for the clips of its test splits"
+            f"{plan.file}: methods: {row.name} has predictions, and the corpus {corpus.name} has no `data`; name its "
+            f"config, such as configs/data/biwi.yaml"
         )
     for seed in seeds if "{seed}" in text else (None,):
         source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(seed)))
@@ -223,7 +210,7 @@ def _source(plan: BenchmarkPlan, kind: Kind, text: str) -> Path:
     expected = "a folder of predictions, .npy files of vertices"
     if kind == "checkpoint":
         expected = "a file of `facediff fit` or import-checkpoint, or a model folder"
-    # A name of the hub, whose content may change, is none of a plan's.
+    # Not a name of the hub: its content may change.
     if not path.exists() or (kind == "predictions" and not any(path.rglob("*.npy"))):
         raise FaceDiffError(f"{text}: not there, or empty; expected {expected}")
     if kind == "checkpoint":
@@ -232,7 +219,7 @@ def _source(plan: BenchmarkPlan, kind: Kind, text: str) -> Path:
 
 
 def _content(kind: Kind, path: Path) -> dict[str, Any]:
-    """What a checkpoint, a model folder or a folder of predictions holds."""
+    """Hashes of a checkpoint, a model folder or a folder of predictions."""
     if kind == "checkpoint":
         return {"sha256": model_hash(path)}
     return describe_files(path, [file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()])
@@ -243,10 +230,8 @@ def _manifest(root: Path | None) -> str:
     return sha256(path) if path is not None and path.is_file() else "none"
 
 
-def config_content(path: Path, outer: tuple[Path, ...] = ()) -> object:
-    """The plain data of a config, with those of the configs that it names in their place: comments do not count."""
-    if path in outer or len(outer) > 20:
-        raise FaceDiffError(f"{path}: names itself; expected a config that ends")
+def config_content(path: Path) -> object:
+    """The plain data of a config, with the content of the configs that it names: comments do not count."""
 
     def expand(value: object) -> object:
         if isinstance(value, dict):
@@ -254,7 +239,7 @@ def config_content(path: Path, outer: tuple[Path, ...] = ()) -> object:
         if isinstance(value, list):
             return [expand(entry) for entry in value]
         if isinstance(value, str) and value.endswith((".yaml", ".yml")) and (path.parent / value).is_file():
-            return config_content((path.parent / value).resolve(), (*outer, path))
+            return config_content((path.parent / value).resolve())
         return value
 
     return expand(load_yaml(path, "expected a config such as configs/experiment/puppet.yaml"))

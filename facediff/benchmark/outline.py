@@ -1,4 +1,4 @@
-"""``plan.json`` in a benchmark's folder: what a report needs of the plan, and which results are its cells'."""
+"""``plan.json`` in a benchmark's folder: the plan's labels and columns for reports, and its cells."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ FileName = Annotated[str, Text(r"(?!\.{0,2}$)[^/\\]+", "a file's name")]
 
 @dataclass(frozen=True)
 class ReportOutline:
-    """What a report needs of the plan, as plain data in the benchmark's folder.
+    """The part of a plan that reports need, as plain data in the benchmark's folder.
 
     Attributes:
         name: of the plan.
         title: of the tables.
-        description: what they are of.
+        description: a sentence about them.
         protocol: by which all was scored.
         columns: scores and :data:`~facediff.benchmark.plan.COSTS` that are shown; all scores if none is named, and all
             costs.
@@ -54,7 +54,7 @@ class ReportOutline:
 
 
 def outline_of(plan: BenchmarkPlan, cells: Sequence[Cell], command: str) -> ReportOutline:
-    """What a report needs of a plan."""
+    """The part of a plan that reports need."""
     return ReportOutline(
         name=plan.name,
         title=plan.title,
@@ -85,12 +85,12 @@ def read_outline(folder: Path) -> ReportOutline:
 
 
 def read_results(folder: Path, outline: ReportOutline) -> tuple[list[Result], list[str]]:
-    """The results of a benchmark's cells, and the names of those that have none yet."""
-    results, missing = [], []
+    """The results of a benchmark's cells, and the names of the cells without a result."""
+    results, pending = [], []
     for name in outline.cells:
         result = read_result(folder / CELLS / f"{name}.json")
         if result is None:
-            missing.append(name)
+            pending.append(name)
         elif result.row in outline.rows and result.corpus in outline.corpora:
             results.append(result)
-    return results, missing
+    return results, pending

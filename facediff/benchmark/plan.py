@@ -18,12 +18,10 @@ from facediff.utils.records import DERIVED, Items, Text, read_record
 from facediff.utils.yaml_files import load_yaml
 
 COSTS = ("weights", "rtf", "training", "memory")
-"""What a table can say of a method besides its scores."""
+"""Columns of a table besides the scores."""
 
 MEAN_SUFFIX = ".mean"
-"""What follows a method's name in that of its further row, the mean of ``model.test_samples`` samples."""
-
-MOST_CELLS = 10_000
+"""Suffix of a method's further row, the mean of ``model.test_samples`` samples."""
 
 Name = Annotated[str, Text(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,60}", "a short name of letters and digits")]
 Line = Annotated[str, Text(r"(?s).*\S.*", "a text")]
@@ -122,8 +120,8 @@ class BenchmarkPlan:
         methods: by name.
         variants: by name.
         title: of the tables.
-        description: what they are of.
-        protocol: by which all is scored.
+        description: a sentence about them.
+        protocol: of all scores.
         metrics: further metrics by name.
         columns: scores and costs that tables show; all scores of the protocol and the metrics if none is named, and all
             costs.
@@ -140,8 +138,8 @@ class BenchmarkPlan:
         file: the file.
     """
 
-    corpora: Mapping[Name, CorpusEntry]
-    methods: Mapping[Name, MethodEntry]
+    corpora: Annotated[Mapping[Name, CorpusEntry], Items(1)]
+    methods: Annotated[Mapping[Name, MethodEntry], Items(1)]
     variants: Mapping[Name, Variant] = field(default_factory=dict)
     title: Line = ""
     description: Line = ""
@@ -165,8 +163,8 @@ def find_plan(path: Path) -> Path:
     """The file of a plan; those of the package are found by ``configs/benchmark/NAME.yaml``, and by NAME alone."""
     if path.is_file():
         return path
-    named = path if path.suffix == ".yaml" else Path(f"{path}.yaml")
-    bundled = config_dir().parent / path if path.parts[:1] == ("configs",) else config_dir() / "benchmark" / named
+    file = path if path.suffix == ".yaml" else Path(f"{path}.yaml")
+    bundled = config_dir().parent / path if path.parts[:1] == ("configs",) else config_dir() / "benchmark" / file
     if bundled.is_file():
         return bundled
     raise FaceDiffError(f"{path}: no such plan; {choices(str(path), bundled_configs('benchmark'))}")
@@ -180,7 +178,7 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkP
         roots: folders of corpora by the plan's names, which override the plan's.
     """
     plan = read_record(BenchmarkPlan, load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path)
-    _check_names("--root", "corpus", roots or {}, plan.corpora)
+    check_names("--root", "corpus", roots or {}, plan.corpora)
     return replace(
         plan,
         name=path.stem,
@@ -194,10 +192,11 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkP
     )
 
 
-def _check_names(place: object, kind: str, names: Iterable[str], known: Collection[str]) -> None:
+def check_names(source: object, kind: str, names: Iterable[str], candidates: Collection[str]) -> None:
+    """Refuse names in a plan that are none of the candidates."""
     for name in names:
-        if name not in known:
-            raise FaceDiffError(f"{place}: there is no {kind} {name!r}: {choices(name, known)}")
+        if name not in candidates:
+            raise FaceDiffError(f"{source}: there is no {kind} {name!r}: {choices(name, candidates)}")
 
 
 def _corpus(name: str, corpus: CorpusEntry, root: Path | None, path: Path) -> CorpusEntry:
@@ -215,20 +214,20 @@ def _corpus(name: str, corpus: CorpusEntry, root: Path | None, path: Path) -> Co
 
 
 def _method(name: str, method: MethodEntry, plan: BenchmarkPlan, path: Path) -> MethodEntry:
-    """The method, once its files and the names in it are known to be there."""
-    place = f"{path}: methods.{name}"
+    """The method, after a check of its files and names."""
+    entry = f"{path}: methods.{name}"
+    check_names(f"{entry}.corpora", "corpus", method.corpora or (), plan.corpora)
+    check_names(f"{entry}.variants", "variant", method.variants or (), plan.variants)
+    per_seed = method.config is not None or "{seed}" in f"{method.checkpoint} {method.predictions}"
+    problem = ""
     if [method.config, method.checkpoint, method.predictions].count(None) != 2:
-        raise FaceDiffError(f"{place}: expected one of config, checkpoint and predictions")
-    if method.checkpoint is not None and method.options:
-        raise FaceDiffError(f"{place}: options are of training, and a checkpoint is trained; use test_options")
-    _check_names(f"{place}.corpora", "corpus", method.corpora or (), plan.corpora)
-    _check_names(f"{place}.variants", "variant", method.variants or (), plan.variants)
-    per_seed = "{seed}" in f"{method.checkpoint} {method.predictions}"
-    if not (plan.seeds or method.seeds) and (method.config is not None or per_seed):
-        raise FaceDiffError(
-            f"{place} is trained, and the plan has no seeds; add `seeds: [0, 1, 2]`, since one training run says "
-            f"nothing of the chance between runs"
-        )
+        problem = "expected one of config, checkpoint and predictions"
+    elif method.checkpoint is not None and method.options:
+        problem = "options are of training, and a checkpoint is trained; use test_options"
+    elif per_seed and not (plan.seeds or method.seeds):
+        problem = "is trained, and the plan has no seeds; add `seeds: [0, 1, 2]`, to see the chance between runs"
+    if problem:
+        raise FaceDiffError(f"{entry}: {problem}")
     for config in [method.config, *(step.config for step in method.before.values())]:
         for corpus in (method.corpora or plan.corpora) if config else ():
             find_config(str(config).replace("{corpus}", corpus), f"methods.{name}.config", path)
@@ -236,10 +235,7 @@ def _method(name: str, method: MethodEntry, plan: BenchmarkPlan, path: Path) -> 
 
 
 def check_scores(plan: BenchmarkPlan) -> None:
-    """Refuse a protocol, a metric, a column or a published table of a plan that there is none of.
-
-    Apart from :func:`read_plan`, since it imports PyTorch.
-    """
+    """Refuse unknown protocols, metrics, columns and published tables; imports PyTorch, unlike :func:`read_plan`."""
     from facediff.benchmark.published import published
     from facediff.evaluation.evaluator import find_protocols
     from facediff.metrics.by_name import parse_all
@@ -250,12 +246,12 @@ def check_scores(plan: BenchmarkPlan) -> None:
         parse_all(plan.metrics)
     except FaceDiffError as error:
         raise FaceDiffError(f"{plan.file}: {error}") from error
-    _check_names(f"{plan.file}: published", "table", plan.published, published())
+    check_names(f"{plan.file}: published", "table", plan.published, published())
     scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *plan.metrics, *SMOOTHNESS, *COSTS]
     # A metric of several scores gives each its own name behind.
-    several = tuple(f"{name}_" for name in plan.metrics)
-    columns = [column for column in plan.columns if not column.startswith(several)]
-    _check_names(f"{plan.file}: columns", "score", columns, scores)
+    prefixes = tuple(f"{name}_" for name in plan.metrics)
+    columns = [column for column in plan.columns if not column.startswith(prefixes)]
+    check_names(f"{plan.file}: columns", "score", columns, scores)
 
 
 def _beside(plan: Path, text: str) -> Path:
@@ -269,12 +265,12 @@ def bundled_configs(folder: str) -> list[str]:
     return [f"configs/{folder}/{file.name}" for file in sorted((config_dir() / folder).glob("*.yaml"))]
 
 
-def find_config(text: str, place: str, plan: Path) -> Path:
+def find_config(text: str, key: str, plan: Path) -> Path:
     """The file of a config: bundled ones begin with ``configs/``."""
-    bundled, own = config_dir() / text.removeprefix("configs/"), _beside(plan, text)
-    if own.is_file() or not (text.startswith("configs/") and bundled.is_file()):
-        bundled = own
-    if not bundled.is_file():
+    bundled, file = config_dir() / text.removeprefix("configs/"), _beside(plan, text)
+    if not file.is_file() and text.startswith("configs/") and bundled.is_file():
+        file = bundled
+    if not file.is_file():
         hint = choices(text, bundled_configs(Path(text).parent.name or "experiment"))
-        raise FaceDiffError(f"{plan}: {place} {text}: no such config; {hint}")
-    return bundled
+        raise FaceDiffError(f"{plan}: {key} {text}: no such config; {hint}")
+    return file

@@ -21,7 +21,7 @@ Points = list[tuple[float, float]]
 
 
 def plots_of(table: Table, report: BenchmarkReport) -> dict[str, Drawing]:
-    """The plots of a table by name; those for which there is nothing to draw are left out."""
+    """The plots of a table by name, without empty ones."""
     drawings = {
         "steps": curves_plot(table, report, "step"),
         "time": curves_plot(table, report, "seconds"),
@@ -37,7 +37,7 @@ def main_column(table: Table) -> str:
 
 
 def curves_plot(table: Table, report: BenchmarkReport, over: str) -> Drawing | None:
-    """LVE of validation over the steps of training, or over its time, mean over the runs; None where nothing is."""
+    """LVE of validation over the steps of training, or over its time, mean over the runs; None without curves."""
     lines: list[tuple[str, Points]] = []  # several rows may have one label
     for row in table.rows:
         runs = [result for result in report.results if (result.row, result.corpus) == (row.name, table.corpus)]
@@ -63,8 +63,8 @@ def mean_curve(runs: list[Result], over: str) -> Points:
     curves = [run.curve for run in runs if not run.problem and run.curve.get(LOSS)]
     curves = [curve for curve in curves if len(curve.get(over) or ()) == len(curve[LOSS])]
     points = []
-    for place in range(min((len(curve[LOSS]) for curve in curves), default=0)):
-        values = [(curve[over][place], curve[LOSS][place]) for curve in curves]
+    for index in range(min((len(curve[LOSS]) for curve in curves), default=0)):
+        values = [(curve[over][index], curve[LOSS][index]) for curve in curves]
         logged = [(x, y) for x, y in values if x is not None and y is not None]
         if logged:
             x, y = np.mean(logged, axis=0)
@@ -79,13 +79,15 @@ def scatter_plot(table: Table) -> Drawing | None:
     base = baseline.scores.get(column)
     if base is None or base.table is None:
         return None
-    own = means_of(base.table)
+    reference = means_of(base.table)
     clouds: list[tuple[str, Points]] = []
     for row in table.rows:
         scores = row.scores.get(column)
         if row.name != table.baseline and not row.reference and scores is not None and scores.table is not None:
             means = means_of(scores.table).items()
-            clouds.append((printable(row.label), [(own[clip], value) for clip, value in means if clip in own]))
+            clouds.append(
+                (printable(row.label), [(reference[clip], value) for clip, value in means if clip in reference])
+            )
     values = [value for _, points in clouds for point in points for value in point]
     if not values:
         return None

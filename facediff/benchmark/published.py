@@ -1,4 +1,4 @@
-"""What papers print, next to ours only where protocol and data agree; where they do not, the reason.
+"""Figures of papers, shown next to ours where protocol and data agree; else the reason why not.
 
 The figures are data of the package, ``published.yaml``, with their source. docs/which_lve.md says why two tables of the
 field can seldom be compared.
@@ -47,13 +47,13 @@ class Published:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What of papers is shown next to a table of ours.
+class PublishedScores:
+    """Figures of papers next to a table of ours.
 
     Attributes:
         scores: the printed figures, by row and score.
-        sources: where they stand.
-        reasons: why tables that were asked for are not shown.
+        sources: their papers and tables.
+        reasons: why tables that a plan names are not shown.
     """
 
     scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
@@ -79,20 +79,8 @@ def shown_tables(
     lips: Mapping[str, Any],
     frames: int,
     sequences: int,
-) -> Shown:
-    """The figures of papers that may stand next to a table.
-
-    Args:
-        names: the papers' tables that are asked for.
-        rows: the paper's name of each of our rows; empty for a row that no paper has.
-        corpus: name of our corpus.
-        synthetic: whether a program made it.
-        split: that was scored.
-        protocol: by which it was scored.
-        lips: our lip region, with its ``count``.
-        frames: that were scored.
-        sequences: that were scored.
-    """
+) -> PublishedScores:
+    """The figures of papers that are comparable with a table; ``rows`` has the papers' names of our rows."""
 
     def disagreement(table: Published) -> str:
         """Why a paper's figures cannot stand next to ours; empty if they can."""
@@ -103,14 +91,14 @@ def shown_tables(
             return f"it scores {table.split}, and this is {split}"
         if table.doubt:
             return table.doubt
-        for what, theirs, ours in (
+        for what, printed, value in (
             ("follows the protocol", table.protocol, protocol),
             ("has lip vertices", table.lips, lips.get("count")),
             ("scores sequences", table.sequences, sequences),
             ("scores frames", table.frames, frames),
         ):
-            if theirs is not None and theirs != ours:
-                return f"it {what} {theirs}, and this {ours}"
+            if printed is not None and printed != value:
+                return f"it {what} {printed}, and this {value}"
         return ""
 
     scores: dict[str, dict[str, float]] = {}
@@ -123,4 +111,4 @@ def shown_tables(
         for row, name in rows.items():
             if name in table.rows:
                 scores.setdefault(row, {}).update(table.rows[name])
-    return Shown(scores, tuple(sources), tuple(reasons))
+    return PublishedScores(scores, tuple(sources), tuple(reasons))

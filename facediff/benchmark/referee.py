@@ -1,8 +1,8 @@
-"""The referee: models on one face, scored by what speech with known phonemes asks of any face.
+"""The referee: models on one face, scored against the known phonemes of their speech.
 
-No recording of a person decides: closures and the mouth's opening follow from the phonemes, and what cannot follow from
-speech (blinks, head) is reported as it is. Faults are planted in every model's motion, which the scores that are for
-them must see. From top to bottom: the scores, the faults, what is reported of a model.
+It needs no recording of a person: closures and the mouth's opening follow from the phonemes; blinks and head, which do
+not, are reported without a judgement. Faults are planted in every model's motion, and the scores must detect them.
+From top to bottom: the scores, the faults, the rows of the report.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class RefereeScore:
         title: in tables.
         ideal: which way is better; None where nothing is better or worse.
         digits: decimals.
-        meaning: what it is.
+        meaning: its definition.
     """
 
     title: str
@@ -89,8 +89,8 @@ SCORES = {
 
 
 @dataclass
-class Tally:
-    """Adds up what one motion of every clip scores.
+class RefereeScores:
+    """The scores of one motion of every clip.
 
     Args:
         frame_rate: of the motion.
@@ -104,7 +104,7 @@ class Tally:
         face = self.face = open_face()
         lips, lids = ([(int(a), int(b)) for a, b in pairs] for pairs in (face.lip_pairs, face.lid_pairs))
         self._pair = torch.from_numpy(face.lip_pairs)
-        # Of channels only the jaw is known: what is read of lips and lids is then left out, and said to be.
+        # Of channels only the jaw is known: scores of lips and lids are left out, and the report says so.
         opened: list[tuple[int, int]] = [(0, 1)]
         self._openings: dict[str, SequenceMetric] = {"correlation": LipOpeningCorrelation(opened)}
         self._faces: dict[str, SequenceMetric] = {}
@@ -133,14 +133,14 @@ class Tally:
         pair, true_pair = (as_pair(series) for series in (mouth, true_mouth))
         for metric in self._openings.values():
             metric.update(pair, true_pair)
-        predicted, spoken = torch.from_numpy(points), torch.from_numpy(true)
+        predicted, target = torch.from_numpy(points), torch.from_numpy(true)
         for metric in self._faces.values():
-            metric.update(predicted, spoken)
+            metric.update(predicted, target)
         timed = [TimedPhoneme(p.start, p.end, p.ipa) for p in clip.phonemes]
         closed = [(start, end) for start, end in closures(timed, self.frame_rate) if end <= frames]
         if self._closures and closed:
             for name in ("", clip.language):
-                self._closures[name].update(predicted, spoken, closures=closed)
+                self._closures[name].update(predicted, target, closures=closed)
             resting = float(self.opening(self.face.rest[None])[0])
             self._gaps += [1000 * float(mouth[start:end].min() - resting) for start, end in closed]
         furthest, least = round(FURTHEST * self.frame_rate), round(OVERLAP * self.frame_rate)
@@ -174,7 +174,7 @@ class Tally:
 
 
 def _note(values: dict[str, float], name: str, metric: SequenceMetric) -> None:
-    """A score, where it has a value: what never moves has no ratio of differences."""
+    """A score, where it has a value: a still face has no ratio of differences."""
     try:
         value = float(metric.compute())
     except ValueError:
@@ -216,25 +216,25 @@ def muted(motion: SpokenMotion, _other: SpokenMotion, _frame_rate: float, face: 
     points = motion.points.copy()
     if points.shape[1:] != face.rest.shape:
         return np.asarray(MUTED * points)
-    places = np.union1d(face.lips, face.lip_pairs)
-    points[:, places] = face.rest[places] + MUTED * (points[:, places] - face.rest[places])
+    lips = np.union1d(face.lips, face.lip_pairs)
+    points[:, lips] = face.rest[lips] + MUTED * (points[:, lips] - face.rest[lips])
     return points
 
 
 def trembling(motion: SpokenMotion, _other: SpokenMotion, _frame_rate: float, _face: OpenFace) -> Array:
-    """The face shakes from frame to frame, the more a place moves."""
+    """The face shakes from frame to frame, in proportion to each point's motion."""
     noise = np.random.default_rng(len(motion.points)).normal(size=(len(motion.points), 1, 1))
     return np.asarray(motion.points + JITTER * noise * motion.points.std(axis=0))
 
 
-def wrong_sentence(motion: SpokenMotion, other: SpokenMotion, _frame_rate: float, _face: OpenFace) -> Array:
-    """Motion for what another sentence says; its last frame is held if it is shorter."""
-    return np.asarray(other.points[np.minimum(np.arange(len(motion.points)), len(other.points) - 1)])
+def wrong_sentence(motion: SpokenMotion, substitute: SpokenMotion, _frame_rate: float, _face: OpenFace) -> Array:
+    """Motion for another sentence; its last frame is held if it is shorter."""
+    return np.asarray(substitute.points[np.minimum(np.arange(len(motion.points)), len(substitute.points) - 1)])
 
 
 @dataclass(frozen=True)
 class PlantedFault:
-    """A fault and the scores that are for it.
+    """A fault and the scores that must detect it.
 
     Attributes:
         title: of its row.
@@ -258,7 +258,7 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class FaultVerdict:
-    """Whether a score sees a fault: its values of the sound model and of the spoilt one."""
+    """Whether a score detects a fault: its values for the sound model and for the spoilt one."""
 
     fault: str
     score: str
@@ -274,7 +274,7 @@ class FaultVerdict:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A row of the report, with those of its planted faults.
+    """A row of the report, with the scores of its planted faults.
 
     Attributes:
         name: of the model.
@@ -298,7 +298,7 @@ class Judgement:
     problem: str = ""
 
     def seen(self) -> list[FaultVerdict]:
-        """What each score that is for a fault says of it, where it says anything."""
+        """The verdict of each score on the faults that it must detect, where it has a value."""
         return [
             FaultVerdict(fault, score, self.scores[score], values[score])
             for fault, values in self.faults.items()
@@ -307,7 +307,7 @@ class Judgement:
         ]
 
     def lacks(self, score: str) -> str:
-        """Why a score has nothing to see in this model, in words; empty if it has."""
+        """Why a score cannot detect faults in this model, in words; empty if it can."""
         if score in ("closures", "gap") and self.scores.get("closures", 1) < CLOSES:
             return f"it closes its lips for fewer than {100 * CLOSES:.0f} % of p, b and m"
         if score in ("correlation", "lag") and self.scores.get("correlation", 0) < FOLLOWS:
@@ -322,23 +322,16 @@ class Judgement:
 def judge(
     clips: Sequence[SpokenClip], motions: Mapping[str, SpokenMotion], frame_rate: float, jaw: int | None
 ) -> tuple[dict[str, float], dict[str, dict[str, float]], Array]:
-    """The scores of a model, those of its planted faults, and the mouth's opening in the first clip.
-
-    Args:
-        clips: what was spoken.
-        motions: what the model made of each.
-        frame_rate: frames a second.
-        jaw: the channel that opens the jaw, of motion that is channels.
-    """
+    """The scores of a model and of its planted faults, and the mouth's opening in the first clip."""
     truths = {clip.name: reference(clip, frame_rate) for clip in clips}
-    sound = Tally(frame_rate, jaw)
+    sound = RefereeScores(frame_rate, jaw)
     for clip in clips:
         sound.add(clip, motions[clip.name], truths[clip.name])
     faults = {}
     for name, fault in FAULTS.items():
         if name == "sentence" and len({clip.text for clip in clips}) < 2:
             continue
-        spoilt = Tally(frame_rate, jaw)
+        spoilt = RefereeScores(frame_rate, jaw)
         for clip in clips:
             motion = motions[clip.name]
             points = fault.spoil(motion, motions[another(clip, clips).name], frame_rate, open_face())
@@ -349,20 +342,20 @@ def judge(
 
 def another(clip: SpokenClip, clips: Sequence[SpokenClip]) -> SpokenClip:
     """The next sentence of the same voice, or else of the same language, or else of any."""
-    place = [other.name for other in clips].index(clip.name)
-    others = [other for other in (*clips[place + 1 :], *clips[:place]) if other.text != clip.text]
+    index = [candidate.name for candidate in clips].index(clip.name)
+    candidates = [candidate for candidate in (*clips[index + 1 :], *clips[:index]) if candidate.text != clip.text]
     for alike in ("voice", "language"):
-        same = [other for other in others if getattr(other, alike) == getattr(clip, alike)]
+        same = [candidate for candidate in candidates if getattr(candidate, alike) == getattr(clip, alike)]
         if same:
             return same[0]
-    return others[0] if others else clip
+    return candidates[0] if candidates else clip
 
 
 def reference_judgement(clips: Sequence[SpokenClip], frame_rate: float = 25.0) -> Judgement:
     """The row of the reference itself, whose faults are not planted."""
-    tally = Tally(frame_rate)
+    scores = RefereeScores(frame_rate)
     for clip in clips:
         motion = reference(clip, frame_rate)
-        tally.add(clip, motion, motion)
-    openings = tally.opening(reference(clips[0], frame_rate).points)
-    return Judgement("reference", tally.scores(), frame_rate=frame_rate, openings=openings)
+        scores.add(clip, motion, motion)
+    openings = scores.opening(reference(clips[0], frame_rate).points)
+    return Judgement("reference", scores.scores(), frame_rate=frame_rate, openings=openings)

@@ -37,16 +37,7 @@ ARROWS = {"higher": " ↑", "lower": " ↓", "zero": " →0", "one": " →1"}
 
 @dataclass(frozen=True)
 class RefereeReport:
-    """What the referee says.
-
-    Attributes:
-        clips: what was spoken.
-        reference: the row of the built-in corpus's own motion.
-        rows: of the models.
-        command: by which it was made.
-        code: version, and commit of a checkout.
-        machine: what computed.
-    """
+    """The referee's verdict on all models, with the motion of the built-in corpus as the reference."""
 
     clips: Sequence[SpokenClip]
     reference: Judgement
@@ -78,22 +69,20 @@ def text(report: RefereeReport) -> str:
 
 def document(report: RefereeReport, drawings: Sequence[Drawing] = ()) -> list[Block]:
     """The whole report."""
-    spoken = {LANGUAGES[clip.language].name for clip in report.clips}
+    languages = {LANGUAGES[clip.language].name for clip in report.clips}
     return [
         Title("Referee"),
         Paragraph(
-            "Synthetic speech and a synthetic face: models are compared with what phonemes ask for, not with people.",
+            "Synthetic speech and a synthetic face: models are compared with the phonemes, not with people.",
             warning=True,
         ),
         scores_table(report),
         *languages_and_costs(report),
         *drawings,
-        Title("What the referee sees", 2),
-        Paragraph(
-            "Faults were planted in every model's motion; each score that is for one of them must find it worse."
-        ),
+        Title("Check of the scores", 2),
+        Paragraph("Faults were planted in every model's motion; the scores that must detect them must be worse."),
         Bullets(self_check(report)),
-        Title("What the numbers are", 2),
+        Title("Definitions", 2),
         Bullets(
             [
                 *(f"{score.title}: {score.meaning}" for score in SCORES.values()),
@@ -101,7 +90,8 @@ def document(report: RefereeReport, drawings: Sequence[Drawing] = ()) -> list[Bl
                 "phonemes, its brows, blinks and head are one of many performances; models that were trained on that "
                 "corpus know its way of speaking",
                 f"{len(report.clips)} sentences, {sum(clip.seconds for clip in report.clips):.0f} s, in "
-                f"{', '.join(sorted(spoken))}; voices {', '.join(dict.fromkeys(clip.voice for clip in report.clips))}",
+                f"{', '.join(sorted(languages))}; voices "
+                f"{', '.join(dict.fromkeys(clip.voice for clip in report.clips))}",
                 f"processor seconds for a second of speech, loading left out; memory is the whole process's; on "
                 f"{report.machine}",
                 f"facediff {' '.join(report.code.values())}; made by `{report.command}`",
@@ -116,10 +106,10 @@ def scores_table(report: RefereeReport) -> ReportTable:
     rows: list[list[str]] = [[row.name, *_cells(row.scores)] for row in sound]
     marks: dict[tuple[int, int], str] = {}
     for column, (name, score) in enumerate(SCORES.items(), 1):
-        values = [(score.badness(row.scores[name]), place) for place, row in enumerate(sound) if name in row.scores]
+        values = [(score.badness(row.scores[name]), index) for index, row in enumerate(sound) if name in row.scores]
         if score.ideal is not None and len(values) > 1:
             best = min(values)[0]
-            marks |= {(place, column): BEST for value, place in values if value == best}
+            marks |= {(index, column): BEST for value, index in values if value == best}
     rows.append([report.reference.name, *_cells(report.reference.scores)])
     rows += [
         [f"{row.name}, {FAULTS[fault].title}", *_cells(values)] for row in sound for fault, values in row.faults.items()
@@ -133,11 +123,11 @@ def _cells(scores: Mapping[str, float]) -> list[str]:
 
 
 def languages_and_costs(report: RefereeReport) -> list[Block]:
-    """Closures in each language, costs and licences, and what kept a model from being scored."""
-    spoken = list(dict.fromkeys(clip.language for clip in report.clips))
+    """Closures in each language, costs and licences, and the reasons why models were not scored."""
+    languages = list(dict.fromkeys(clip.language for clip in report.clips))
     rows = []
     for row in report.rows:
-        closed = [row.scores.get(f"closures_{code}") for code in spoken]
+        closed = [row.scores.get(f"closures_{code}") for code in languages]
         cost = [
             NONE if row.seconds is None else f"{row.seconds:.3g}",
             NONE if row.memory is None else f"{row.memory / 2**20:.0f} MiB",
@@ -145,7 +135,7 @@ def languages_and_costs(report: RefereeReport) -> list[Block]:
         ]
         shares = [NONE if share is None else f"{share:.2f}" for share in closed]
         rows.append([row.name, *shares, *cost, row.facts.get("commercial use", "unknown")])
-    head = ["closures in", *(LANGUAGES[code].name for code in spoken), "CPU s/s", "memory", "fps", "commercial use"]
+    head = ["closures in", *(LANGUAGES[code].name for code in languages), "CPU s/s", "memory", "fps", "commercial use"]
     notes = [
         f"{row.name}: {title}: {value}"
         for row in report.rows
@@ -157,7 +147,7 @@ def languages_and_costs(report: RefereeReport) -> list[Block]:
 
 
 def self_check(report: RefereeReport) -> list[str]:
-    """What the scores see of the planted faults, a line for each model and fault."""
+    """Which planted faults the scores detect, a line for each model and fault."""
     lines = []
     for row in report.rows:
         for fault, planted in FAULTS.items() if not row.problem else ():
@@ -170,7 +160,7 @@ def self_check(report: RefereeReport) -> list[str]:
             reasons = dict.fromkeys(reason for score in planted.seen_by if (reason := row.lacks(score)))
             changes += [f"not asked further, since {' and '.join(reasons)}"] if reasons else []
             if not changes:
-                changes = ["nothing that is scored of this model shows it"]
+                changes = ["no score of this model can detect it"]
             count = sum(check.seen for check in checks)
             verdict = "the referee sees" if checks and count == len(checks) else "NOT SEEN by all scores:"
             lines.append(f"{verdict if checks else 'no score for'} {row.name}, {planted.title}: {'; '.join(changes)}")

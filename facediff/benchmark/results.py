@@ -1,4 +1,4 @@
-"""The result of a cell: one JSON file of plain data, with everything that a number needs to be believed."""
+"""The result of a cell: one JSON file of plain data, with protocol, regions, machine and training run."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Result:
-    """What a cell gave.
+    """The result of a cell.
 
     Attributes:
         row: name of the row.
@@ -52,15 +52,15 @@ class Result:
         seed: of the training; None if nothing was trained.
         kind: ``fit``, ``checkpoint`` or ``predictions``.
         key: hash of the cell's recipe.
-        config: hash of what was trained, the seed left out.
+        config: hash of the training without its seed.
         problem: why the cell failed; empty if it did not.
         code: version, and commit of a checkout.
         source: the checkpoint or the folder that was scored.
         provenance: the training run, as plain data; empty where it is not known.
         synthetic: whether a program made the corpus.
-        protocol: by which it was scored.
-        definition: what each number means, in words.
-        machine: what computed.
+        protocol: of the scores.
+        definition: of each number, in words.
+        machine: processor, GPU and versions.
         measured: seconds and bytes of memory of each step.
         columns: how each score is pooled, and which way it is better.
         scores: a row for each split and method (``model``, ``still``, ``mean_face``, ``shuffled``), with regions,
@@ -172,17 +172,17 @@ def model_result(
     machine: Mapping[str, Any],
     measured: Mapping[str, Mapping[str, float | None]],
     curve: Mapping[str, Sequence[float | None]],
-    shown: str,
+    source: str,
 ) -> Result:
-    """The result of a cell from what ``facediff test`` wrote."""
+    """The result of a cell from the report of ``facediff test``."""
     fitted = sum(step.get("seconds") or 0.0 for name, step in measured.items() if not name.startswith("test"))
     steps = [value for value in curve.get("step", ()) if value is not None]
-    # Validation is logged with steps; time is what the whole training took, shared out over its steps.
+    # Validation is logged with steps; the time of the training is divided evenly among them.
     seconds = {"seconds": [fitted * value / steps[-1] for value in steps]} if steps and steps[-1] else {}
     return Result(
         **_of(cell),
         code=code_of(),
-        source=shown,
+        source=source,
         provenance=report["provenance"],
         synthetic=bool(report["synthetic"]),
         protocol=str(report["scores"][0]["protocol"]),
@@ -203,9 +203,9 @@ def predictions_result(
     *,
     machine: Mapping[str, Any],
     measured: Mapping[str, Mapping[str, float | None]],
-    shown: str,
+    source: str,
 ) -> Result:
-    """The result of a cell from what ``facediff evaluate`` wrote; clips outside the test splits do not count."""
+    """The result of a cell from the report of ``facediff evaluate``; clips outside the test splits do not count."""
     (method,) = report["methods"]
     facts = {score["metric"]: score for score in method["scores"]}
     columns = {name: {"pooling": score["pooling"], "better": score["better"]} for name, score in facts.items()}
@@ -232,7 +232,7 @@ def predictions_result(
     return Result(
         **_of(cell),
         code=code_of(),
-        source=shown,
+        source=source,
         provenance={} if provenance is None else provenance.as_dict(),
         protocol=method["scores"][0]["protocol"],
         definition="\n".join(report["protocols"].values()),
@@ -263,7 +263,7 @@ def code_of() -> dict[str, str]:
 
 
 def pool(rows: Sequence[Mapping[str, Any]], column: str, pooling: str | None) -> float | None:
-    """The score of several sequences; None if it is no mean of theirs, or none of them has one."""
+    """The pooled score of several sequences; None if it is no mean, or no sequence has a value."""
     valued = [(row[column], row["frames"] if pooling == "frames" else 1) for row in rows if row.get(column) is not None]
     total = sum(weight for _, weight in valued)
     return None if pooling is None or not total else sum(value * weight for value, weight in valued) / total

@@ -1,7 +1,7 @@
 """Running the cells of a plan: each training and each test in a process of its own, several cells at a time.
 
-What is finished is on the disk whole, and what is not leaves a training that continues where it was stopped, bit for
-bit. So it does not matter when a benchmark is killed, nor how often.
+Results are written as complete files, and an unfinished training continues where it was stopped, bit for bit. So a
+benchmark may be killed at any time, and as often as you like.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ REPORT = Path("version_0", "test_report.json")
 
 @dataclass(frozen=True)
 class Setting:
-    """What all cells of a run share.
+    """The settings that all cells of a run share.
 
     Attributes:
         folder: the benchmark's folder.
-        protocol: by which all is scored.
+        protocol: of all scores.
         metrics: further metrics.
         weights: ``last`` or ``best``.
         threads: of each process.
@@ -80,17 +80,7 @@ def pending(cells: Sequence[Cell], folder: Path, *, retry_failed: bool) -> list[
 def run_cells(
     cells: Sequence[Cell], setting: Setting, *, workers: int | None, scheduler: str | None = ""
 ) -> Generator[tuple[Cell, Outcome[Result]]]:
-    """Run cells, several at a time; each gets its file when it is done, also when it fails.
-
-    Args:
-        cells: what to run.
-        setting: what they share.
-        workers: cells at a time; if None, as many as processors, or workers of a cluster.
-        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
-
-    Returns:
-        a cell and what became of it, as soon as it is done.
-    """
+    """Run cells, several at a time; each gets its file when it is done, also when it fails."""
     return run_batch(
         partial(run_cell, setting),
         cells,
@@ -104,19 +94,19 @@ def run_cells(
 
 
 def files_of(cell: Cell) -> list[Path]:
-    """The files and folders that a cell is made of, except those that other cells make."""
-    named = [cell.root, cell.data, cell.source, *(training.config for training in cell.trainings)]
-    return [path for path in named if isinstance(path, Path) and path.exists()]
+    """The files and folders that a cell reads, except files that other cells make."""
+    paths = [cell.root, cell.data, cell.source, *(training.config for training in cell.trainings)]
+    return [path for path in paths if isinstance(path, Path) and path.exists()]
 
 
 def record_failure(folder: Path, cell: Cell, problem: str, _result: Result | None) -> None:
-    """Write why a cell failed in place of its result; a result has written itself."""
+    """Write the reason of a failure in place of a result; results write themselves."""
     if problem:
         Result.failed(cell, problem, machine_of(0)).write(folder)
 
 
 def run_cell(setting: Setting, cell: Cell) -> Result:
-    """Do all that a cell needs, and write its result."""
+    """Train and score a cell, and write its result."""
     folder = setting.folder / RUNS / cell.folder_name
     folder.mkdir(parents=True, exist_ok=True)
     machine = machine_of(setting.threads)
@@ -134,8 +124,8 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
     for training in cell.trainings:
         checkpoints[training.name] = runner.fit(training, checkpoints, cell)
     checkpoint = cell.source if cell.source is not None else checkpoints[cell.trainings[-1].name]
-    place = folder / f"test-{cell.key[:12]}"
-    arguments = ["test", "--ckpt_path", str(checkpoint), *logger_words(place), *progress_words()]
+    run = folder / f"test-{cell.key[:12]}"
+    arguments = ["test", "--ckpt_path", str(checkpoint), *logger_words(run), *progress_words()]
     metrics = list(dict.fromkeys([*setting.metrics, "real_time_factor"]))
     root = cell.root or (setting.roots.get(cell.corpus) if cell.kind == "checkpoint" else None)
     options = {
@@ -146,10 +136,10 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
         **({} if root is None else {"data.root": str(root)}),
         **cell.test_options,
     }
-    runner.run(place.name, [*arguments, *option_words(options)])
-    report = load_json(place / REPORT)
+    runner.run(run.name, [*arguments, *option_words(options)])
+    report = load_json(run / REPORT)
     curves = {} if not cell.trainings else curve_of(folder / cell.trainings[-1].name / "version_0" / "metrics.csv")
-    return model_result(cell, report, machine=machine, measured=runner.measured, curve=curves, shown=str(checkpoint))
+    return model_result(cell, report, machine=machine, measured=runner.measured, curve=curves, source=str(checkpoint))
 
 
 def _score_predictions(setting: Setting, cell: Cell, folder: Path, machine: dict[str, Any]) -> Result:
@@ -161,7 +151,7 @@ def _score_predictions(setting: Setting, cell: Cell, folder: Path, machine: dict
     runner.run("evaluate", [*arguments, "--bootstrap", "0", "--quiet", "--json", str(report)])
     content = load_json(report)
     return predictions_result(
-        cell, content, setting.clips[cell.corpus], machine=machine, measured=runner.measured, shown=str(cell.source)
+        cell, content, setting.clips[cell.corpus], machine=machine, measured=runner.measured, source=str(cell.source)
     )
 
 
@@ -178,9 +168,9 @@ class Runner:
 
     def fit(self, training: Training, checkpoints: Mapping[str, Path], cell: Cell) -> Path:
         """Train, or continue a training that was stopped; the checkpoint."""
-        place = self.folder / training.name
-        state = read_json(place / STATE) or {}
-        last, best = place / LAST, place / BEST
+        folder = self.folder / training.name
+        state = read_json(folder / STATE) or {}
+        last, best = folder / LAST, folder / BEST
         if not state.get("done") or not (last.is_file() or best.is_file()):
             refuse_changed(training, cell)
             arguments = ["fit", "--config", str(training.config)]
@@ -190,14 +180,14 @@ class Runner:
             if last.is_file() and "started" in state:
                 before += max(0.0, last.stat().st_mtime - float(state["started"]))
                 arguments += ["--ckpt_path", str(last)]
-            elif place.is_dir():
-                discard(place)
-            place.mkdir(parents=True, exist_ok=True)
-            write_json(place / STATE, {"seconds": before, "started": time.time()})
-            self.run(training.name, [*arguments, *logger_words(place), *option_words(options), *progress_words()])
+            elif folder.is_dir():
+                discard(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            write_json(folder / STATE, {"seconds": before, "started": time.time()})
+            self.run(training.name, [*arguments, *logger_words(folder), *option_words(options), *progress_words()])
             took = self.measured[training.name]
             took["seconds"] = before + (took["seconds"] or 0.0)
-            write_json(place / STATE, {"done": True, **took})
+            write_json(folder / STATE, {"done": True, **took})
         else:
             self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
         checkpoint = best if self.setting.weights == "best" else last
@@ -219,13 +209,13 @@ class Runner:
         with log.open("ab") as stream:
             stream.write(f"\n$ facediff {' '.join(arguments)}\n".encode(errors="surrogateescape"))
             stream.flush()
-            place = stream.tell()
+            start = stream.tell()
             program, *module = self.setting.launcher
             program = program if shutil.which(program) else sys.executable  # a cluster's may lie somewhere else
             status, memory = run_process([program, *module, *arguments], environment, stream)
         self.measured[step] = {"seconds": time.monotonic() - started, "memory": memory}
         if status:
-            raise FaceDiffError(f"{self.cell}: {arguments[0]} {reason_of(log, place, status)}")
+            raise FaceDiffError(f"{self.cell}: {arguments[0]} {reason_of(log, start, status)}")
 
     @property
     def _log(self) -> Path:
@@ -247,12 +237,11 @@ def fit_options(training: Training, checkpoints: Mapping[str, Path], cell: Cell)
 
 
 def refuse_changed(training: Training, cell: Cell) -> None:
-    """Refuse a config that was edited since the cells were made: its result would bear the hash of what it was."""
+    """Refuse a config that was edited since the cells were made: its result would bear the hash of the old content."""
     (hashed,) = (entry["config"] for entry in cell.trained["trainings"] if entry["name"] == training.name)
     if hash_of(config_content(training.config)) != hash_of(hashed):
         raise FaceDiffError(
-            f"{cell}: {training.config} was changed while the benchmark ran; run the benchmark again, which takes it "
-            f"as it is now"
+            f"{cell}: {training.config} was changed while the benchmark ran; run the benchmark again with it"
         )
 
 
@@ -265,12 +254,12 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
     return arguments
 
 
-def logger_words(place: Path) -> list[str]:
-    """Where a run of Lightning's commands goes."""
+def logger_words(run: Path) -> list[str]:
+    """The options that put a run of Lightning's commands into a folder."""
     return [
         f"--trainer.logger={LOGGER}",
-        f"--trainer.logger.save_dir={place.parent}",
-        f"--trainer.logger.name={place.name}",
+        f"--trainer.logger.save_dir={run.parent}",
+        f"--trainer.logger.name={run.name}",
         "--trainer.logger.version=0",
     ]
 
@@ -306,20 +295,20 @@ def run_process(command: Sequence[str], environment: Mapping[str, str], log: IO[
     return process.returncode, memory
 
 
-def reason_of(log: Path, place: int, status: int) -> str:
-    """Why a command failed, from what it printed after a place in its log."""
+def reason_of(log: Path, start: int, status: int) -> str:
+    """Why a command failed, from the output after a position in its log."""
     if status < 0:
         return f"was killed by signal {-status}, perhaps for lack of memory; run fewer --workers (log: {log})"
     with log.open("rb") as stream:
-        stream.seek(max(place, stream.seek(0, os.SEEK_END) - 65536))
+        stream.seek(max(start, stream.seek(0, os.SEEK_END) - 65536))
         lines = stream.read().decode("utf-8", "replace").splitlines()
     mark = "facediff: error: "
-    named = next((line.removeprefix(mark) for line in reversed(lines) if line.startswith(mark)), "")
-    return f"failed: {named}" if named else f"ended with status {status}; its log {log} says why"
+    error = next((line.removeprefix(mark) for line in reversed(lines) if line.startswith(mark)), "")
+    return f"failed: {error}" if error else f"ended with status {status}; its log {log} says why"
 
 
 def machine_of(threads: int) -> dict[str, Any]:
-    """What computes, for the speed column."""
+    """The machine, for the speed column."""
     import torch
 
     gpu = torch.cuda.is_available()

@@ -1,4 +1,4 @@
-"""How sure a difference between two rows is, with its two sources of chance kept apart.
+"""Intervals and tests of differences between two rows, for both sources of chance: sentences and training runs.
 
 A score depends on which sentences were recorded, and on which numbers the training happened to draw. A bootstrap or a
 permutation over sentences knows nothing of the second, and the spread over seeds nothing of the first. Where both act,
@@ -24,7 +24,7 @@ class RowScores:
 
     Attributes:
         runs: the score of each training run (runs,).
-        table: a row a sentence, a column a training run; None if the score is no mean of those of sentences.
+        table: a row a sentence, a column a training run; None if the score is no mean over sentences.
         fixed: whether nothing was trained, so that there is no chance between runs.
     """
 
@@ -60,7 +60,7 @@ def mean_resampled(table: ScoreMatrix, bootstrap: Bootstrap) -> Array | None:
 
 
 def shares(table: ScoreMatrix) -> Array:
-    """What each sentence adds to the mean over the runs; their sum is the score over these sentences."""
+    """The part of each sentence in the mean over the runs; their sum is the score over these sentences."""
     return np.asarray((table.values * table.weights / table.weights.sum(0)).mean(1))
 
 
@@ -71,12 +71,12 @@ class Difference:
     Attributes:
         value: the difference of the means over runs, over the sentences of which both have a value.
         sentences: bootstrap interval over sentences; None if there is none.
-        p_sentences: of the permutation test over sentences; None if the score is no mean of those of sentences.
+        p_sentences: of the permutation test over sentences; None if the score is no mean over sentences.
         runs: interval over training runs (Welch); None if the chance between runs is not known.
         p_runs: of Welch's test; None as for ``runs``.
-        both: interval over sentences and training runs together; None if the chance between runs is not known.
-        p: of the test with both; None as for ``both``, and where nothing of the score is by chance.
-        common: sentences of which both have a value.
+        total: interval over sentences and training runs together; None if the chance between runs is not known.
+        p: of the test with both chances; None as for ``total``, and where the score has no chance.
+        common: sentences with a value in both rows.
     """
 
     value: float
@@ -84,44 +84,44 @@ class Difference:
     p_sentences: float | None
     runs: Interval | None
     p_runs: float | None
-    both: Interval | None
+    total: Interval | None
     p: float | None
     common: int
 
 
-def difference(one: RowScores, other: RowScores, bootstrap: Bootstrap) -> Difference:
+def difference(one: RowScores, baseline: RowScores, bootstrap: Bootstrap) -> Difference:
     """Compare two rows by one score.
 
     Args:
         one: the row.
-        other: the row that is subtracted.
+        baseline: the row that is subtracted.
         bootstrap: resamples, level and seed; the permutations have the same seed.
     """
-    p_runs, runs = welch(one, other, bootstrap.level)
-    tables = in_both(one, other)
+    p_runs, runs = welch(one, baseline, bootstrap.level)
+    tables = in_both(one, baseline)
     if tables is None:
-        # Training runs are all the chance that there is, unless nothing was trained.
-        alone = one.table is None and other.table is None and not (one.fixed and other.fixed)
-        p, both = (p_runs, runs) if alone else (None, None)
-        return Difference(one.mean - other.mean, None, None, runs, p_runs, both, p, 0)
+        # Training runs are the only chance, unless nothing was trained.
+        only_runs = one.table is None and baseline.table is None and not (one.fixed and baseline.fixed)
+        p, total = (p_runs, runs) if only_runs else (None, None)
+        return Difference(one.mean - baseline.mean, None, None, runs, p_runs, total, p, 0)
     gaps = shares(tables[0]) - shares(tables[1])
     p_sentences = sign_flip(gaps[~np.isnan(gaps)], seed=bootstrap.seed)
     mine, yours = (mean_resampled(table, bootstrap) for table in tables)
     interval = None if mine is None or yours is None else bootstrap.intervals((mine - yours)[:, None], 1)[0]
-    trained = [scores.runs for scores in (one, other) if not scores.fixed]
-    p, both = both_chances(gaps[~np.isnan(gaps)], trained, bootstrap.level)
+    trained = [scores.runs for scores in (one, baseline) if not scores.fixed]
+    p, total = both_chances(gaps[~np.isnan(gaps)], trained, bootstrap.level)
     common = len(tables[0].clips)
-    return Difference(float(gaps.sum()), interval, p_sentences, runs, p_runs, both, p, common)
+    return Difference(float(gaps.sum()), interval, p_sentences, runs, p_runs, total, p, common)
 
 
-def in_both(one: RowScores, other: RowScores) -> tuple[ScoreMatrix, ScoreMatrix] | None:
-    """The sentences of which both rows have a value in some run; None if there are none."""
-    if one.table is None or other.table is None:
+def in_both(one: RowScores, two: RowScores) -> tuple[ScoreMatrix, ScoreMatrix] | None:
+    """The scores of the sentences with a value in both rows in some run; None if there are none."""
+    if one.table is None or two.table is None:
         return None
-    # One that a single row has would count as a gap as large as that row's score.
-    theirs = set(other.table.valued())
-    clips = [clip for clip in one.table.valued() if clip in theirs]
-    return (one.table.at(clips), other.table.at(clips)) if clips else None
+    # A sentence of a single row would count as a gap as large as that row's score.
+    common = set(two.table.valued())
+    clips = [clip for clip in one.table.valued() if clip in common]
+    return (one.table.at(clips), two.table.at(clips)) if clips else None
 
 
 def both_chances(gaps: Array, runs: Sequence[Array], level: float = 0.95) -> tuple[float | None, Interval | None]:
@@ -152,7 +152,7 @@ def both_chances(gaps: Array, runs: Sequence[Array], level: float = 0.95) -> tup
     return 2 * float(student.sf(abs(gap) / error, freedom)), Interval(gap - reach, gap + reach)
 
 
-def welch(one: RowScores, other: RowScores, level: float = 0.95) -> tuple[float | None, Interval | None]:
+def welch(one: RowScores, two: RowScores, level: float = 0.95) -> tuple[float | None, Interval | None]:
     """Welch's t-test between the training runs of two rows, and its interval of the difference.
 
     A row that was not trained has one value without chance, against which the other's runs are tested. Where both are
@@ -163,16 +163,16 @@ def welch(one: RowScores, other: RowScores, level: float = 0.95) -> tuple[float 
     """
     from scipy.stats import ttest_1samp, ttest_ind
 
-    trained = [scores.runs for scores in (one, other) if not scores.fixed]
+    trained = [scores.runs for scores in (one, two) if not scores.fixed]
     if any(len(runs) < 2 for runs in trained):
         return None, None
-    gap = one.mean - other.mean
+    gap = one.mean - two.mean
     if all(np.ptp(runs) == 0 for runs in trained):
         return (0.0 if gap else 1.0), Interval(gap, gap)
     if len(trained) == 2:
-        test = ttest_ind(one.runs, other.runs, equal_var=False)
+        test = ttest_ind(one.runs, two.runs, equal_var=False)
     else:
-        test = ttest_1samp(one.runs - other.mean if other.fixed else one.mean - other.runs, 0)
+        test = ttest_1samp(one.runs - two.mean if two.fixed else one.mean - two.runs, 0)
     return float(test.pvalue), Interval(*map(float, test.confidence_interval(level)))
 
 
@@ -192,24 +192,24 @@ def compared(
     return {name: (comparison, adjusted.get(name)) for name, comparison in differences.items()}
 
 
-def hears(own: RowScores, shuffled: RowScores, sign: int, bootstrap: Bootstrap) -> bool:
-    """Whether a method's score is better with the sentence's own speech than with another's, and not by chance alone.
+def follows_speech(scores: RowScores, shuffled: RowScores, sign: int, bootstrap: Bootstrap) -> bool:
+    """Whether a method's score is significantly better with the sentence's speech than with another sentence's.
 
     Both are of the same training runs, so that runs are paired. With one run alone, sentences decide.
 
     Args:
-        own: scores with the sentences' own speech.
+        scores: with the sentences' own speech.
         shuffled: of the same runs with other sentences' speech.
         sign: 1 where lower is better, −1 where higher is.
         bootstrap: its level decides, its seed is the permutations'.
     """
-    gap = sign * (shuffled.mean - own.mean)
-    tables = in_both(own, shuffled)
+    gap = sign * (shuffled.mean - scores.mean)
+    tables = in_both(scores, shuffled)
     if gap <= 0 or tables is None:
         return gap > 0
     gaps = shares(tables[1]) - shares(tables[0])
     gaps = gaps[~np.isnan(gaps)]
-    p, _ = both_chances(gaps, [own.runs - shuffled.runs], bootstrap.level)
+    p, _ = both_chances(gaps, [scores.runs - shuffled.runs], bootstrap.level)
     return (sign_flip(gaps, seed=bootstrap.seed) if p is None else p) < 1 - bootstrap.level
 
 
@@ -226,14 +226,14 @@ def marked(rows: Mapping[str, RowScores], better: str | None, bootstrap: Bootstr
     sign = 1 if better == "lower" else -1
     order = sorted(rows, key=lambda name: (sign * rows[name].mean, name))
     marks: dict[str, str] = {}
-    for place, mark in enumerate(("best", "second")):
-        behind = order[place + 1 :]
+    for rank, mark in enumerate(("best", "second")):
+        behind = order[rank + 1 :]
         if not behind:
             break
-        leader = rows[order[place]]
+        leader = rows[order[rank]]
         values = [difference(leader, rows[name], bootstrap).p for name in behind]
         tested = [value for value in values if value is not None]
         if len(tested) < len(values) or max(holm(tested)) >= 1 - bootstrap.level:
             break
-        marks[order[place]] = mark
+        marks[order[rank]] = mark
     return marks

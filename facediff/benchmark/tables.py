@@ -10,9 +10,9 @@ import numpy as np
 
 from facediff.benchmark.outline import ReportOutline
 from facediff.benchmark.plan import COSTS, MEAN_SUFFIX
-from facediff.benchmark.published import Shown, shown_tables
+from facediff.benchmark.published import PublishedScores, shown_tables
 from facediff.benchmark.results import Result
-from facediff.benchmark.statistics import Difference, RowScores, compared, hears, marked
+from facediff.benchmark.statistics import Difference, RowScores, compared, follows_speech, marked
 from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils import ranges
@@ -90,7 +90,7 @@ class Table:
     sequences: int
     regions: Mapping[str, Any]
     notes: list[str]
-    published: Shown
+    published: PublishedScores
 
     @property
     def title(self) -> str:
@@ -104,14 +104,14 @@ class Table:
 
 @dataclass(frozen=True)
 class BenchmarkReport:
-    """All tables of a benchmark, with how sure they are, and of what."""
+    """All tables of a benchmark, with their intervals and definitions."""
 
     outline: ReportOutline
     tables: list[Table]
     bootstrap: Bootstrap
     definition: str
     results: list[Result]
-    missing: list[str]  # cells without a result
+    pending: list[str]  # cells without a result
     failed: list[str]  # why cells failed
     remarks: list[str]
 
@@ -119,7 +119,7 @@ class BenchmarkReport:
 def report_of(
     outline: ReportOutline,
     results: Sequence[Result],
-    missing: Sequence[str] = (),
+    pending: Sequence[str] = (),
     *,
     baseline: str | None = None,
     resamples: ranges.Resamples = 2000,
@@ -131,26 +131,28 @@ def report_of(
     Args:
         outline: of the plan.
         results: of its cells.
-        missing: cells that have no result yet.
+        pending: cells without a result.
         baseline: the row that all others are compared with, instead of the plan's.
         resamples: of the bootstrap over sentences.
         level: of intervals, and 1 − the level of significance.
         seed: of resamples and permutations.
     """
     bootstrap = Bootstrap(resamples, level, seed)
-    done = [result for result in results if not result.problem]
+    scored = [result for result in results if not result.problem]
     failed = [result.problem for result in results if result.problem]
     tables = []
     for corpus in outline.corpora:
-        of_corpus = [result for result in done if result.corpus == corpus]
+        of_corpus = [result for result in scored if result.corpus == corpus]
         splits = dict.fromkeys(str(row["split"]) for result in of_corpus for row in result.scores)
         tables += [_table(outline, of_corpus, corpus, split, baseline, bootstrap) for split in splits]
-    definition = "\n".join(dict.fromkeys(line for result in done for line in result.definition.splitlines()))
-    return BenchmarkReport(outline, tables, bootstrap, definition, list(results), list(missing), failed, _remarks(done))
+    definition = "\n".join(dict.fromkeys(line for result in scored for line in result.definition.splitlines()))
+    return BenchmarkReport(
+        outline, tables, bootstrap, definition, list(results), list(pending), failed, _remarks(scored)
+    )
 
 
 def _remarks(results: Sequence[Result]) -> list[str]:
-    """What makes cells of one benchmark differ that should not."""
+    """Unwanted differences between the cells of one benchmark."""
     remarks = []
     for what, values in (
         ("versions of the code", {(" ".join(result.code.values())) for result in results}),
@@ -174,9 +176,9 @@ def _table(
     groups = {name: group for name, group in groups.items() if any(_row_of(result, split, "model") for result in group)}
     first = next(iter(groups.values()))[0]
     columns = _columns(outline, [result for group in groups.values() for result in group], split)
-    wanted = [name for name in (baseline, outline.baseline) if name]
-    chosen = next((name for name in wanted if name.removesuffix(MEAN_SUFFIX) in groups), next(iter(groups)))
-    compared_with = chosen.removesuffix(MEAN_SUFFIX)
+    stated = (name for name in (baseline, outline.baseline) if name and name.removesuffix(MEAN_SUFFIX) in groups)
+    baseline = next(stated, next(iter(groups)))
+    compared_with = baseline.removesuffix(MEAN_SUFFIX)
     rows = []
     for name, group in groups.items():
         label = outline.rows[name][0]
@@ -193,9 +195,9 @@ def _table(
                 label = REFERENCE_LABELS[reference].format(row=outline.rows[name][0] if name else "")
                 title = f"{name}.{reference}" if name else reference
                 rows.append(_row(title, label, group, split, reference, columns, bootstrap))
-    if all(row.name != chosen for row in rows):  # the mean of a method that draws no samples
-        chosen = compared_with
-    rows = _with_comparisons(rows, columns, chosen, bootstrap)
+    if all(row.name != baseline for row in rows):  # the mean of a method that draws no samples
+        baseline = compared_with
+    rows = _with_comparisons(rows, columns, baseline, bootstrap)
     scored = _row_of(first, split, "model") or {}
     clips = {clip for row in rows for scores in row.scores.values() for clip in scores.clips}
     regions = dict(scored.get("regions") or {})
@@ -220,30 +222,30 @@ def _table(
         costs=tuple(name for name in outline.columns if name in COSTS) or COSTS,
         columns={name: facts.get("better") for name, facts in columns.items()},
         rows=rows,
-        baseline=chosen,
+        baseline=baseline,
         frames=frames,
         sequences=len(clips),
         regions=regions,
-        notes=[*_notes(rows, columns, len(clips), manifests), *_deaf(rows, columns, bootstrap)],
+        notes=[*_notes(rows, columns, len(clips), manifests), *_shuffled_notes(rows, columns, bootstrap)],
         published=published,
     )
 
 
 def _row_of(result: Result, split: str, method: str) -> Mapping[str, Any] | None:
-    """What a cell scored of a method on a split."""
+    """The scores of a cell for a method on a split."""
     return next((row for row in result.scores if (row["split"], row["method"]) == (split, method)), None)
 
 
 def _columns(outline: ReportOutline, results: Sequence[Result], split: str) -> dict[str, Mapping[str, str | None]]:
-    """The scores that are shown, in order, and how each is pooled."""
+    """The columns of scores, in order, and how each is pooled."""
     scored: dict[str, Mapping[str, str | None]] = {}
     for result in results:
         for name, facts in result.columns.items():
             row = _row_of(result, split, "model")
             if row is not None and row.get(name) is not None:
                 scored.setdefault(name, facts)
-    shown = [name for name in outline.columns if name in scored] or list(scored)
-    return {name: scored[name] for name in shown}
+    names = [name for name in outline.columns if name in scored] or list(scored)
+    return {name: scored[name] for name in names}
 
 
 def _row(
@@ -328,22 +330,24 @@ def _with_comparisons(
     return [replace(row, marks=marks[row.name], differences=differences[row.name]) for row in rows]
 
 
-def _deaf(rows: Sequence[TableRow], columns: Mapping[str, Mapping[str, str | None]], bootstrap: Bootstrap) -> list[str]:
-    """Which methods another sentence's speech serves as well as the own one, score by score."""
+def _shuffled_notes(
+    rows: Sequence[TableRow], columns: Mapping[str, Mapping[str, str | None]], bootstrap: Bootstrap
+) -> list[str]:
+    """Methods that score as well with another sentence's speech, score by score."""
     shuffled = {row.name.removesuffix(".shuffled"): row.scores for row in rows if row.name.endswith(".shuffled")}
     notes = []
     for column, facts in columns.items():
         sign = SIGNS.get(str(facts.get("better")))
-        deaf = [
+        labels = [
             row.label
             for row in rows
             if sign is not None
             and column in row.scores
             and column in shuffled.get(row.name, {})
-            and not hears(row.scores[column], shuffled[row.name][column], sign, bootstrap)
+            and not follows_speech(row.scores[column], shuffled[row.name][column], sign, bootstrap)
         ]
-        if deaf:
-            notes.append(f"by {column}, another sentence's speech does as well as the own: {', '.join(deaf)}")
+        if labels:
+            notes.append(f"by {column}, another sentence's speech gives equal scores: {', '.join(labels)}")
     return notes
 
 
@@ -353,21 +357,21 @@ def _notes(
     clips: int,
     manifests: set[str],
 ) -> list[str]:
-    """What a reader of the table has to know."""
+    """Notes below the table."""
     notes = []
-    own = [row for row in rows if not row.reference]
-    single = [row.label for row in own if len(row.seeds) == 1]
+    methods = [row for row in rows if not row.reference]
+    single = [row.label for row in methods if len(row.seeds) == 1]
     if single:
         notes.append(
-            f"of one training run only, so that nothing is known of the chance between runs, and no difference from it "
-            f"is called significant: {', '.join(single)}"
+            f"a single training run: the chance between runs is unknown, and no difference is called significant: "
+            f"{', '.join(single)}"
         )
     fewer = [f"{row.label} ({row.clips} of {clips})" for row in rows if row.clips < clips]
     if fewer:
         notes.append(f"not scored on all sentences; compare differences, not scores: {', '.join(fewer)}")
     for column, facts in columns.items():
         sign = SIGNS.get(str(facts.get("better")))
-        scored = [row for row in own if column in row.scores]
+        scored = [row for row in methods if column in row.scores]
         if sign is None or not scored:
             continue
         for row in rows:

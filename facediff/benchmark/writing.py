@@ -38,7 +38,7 @@ TITLES = {
     "rtf": "RTF",
 }
 MOST_DIGITS = 4
-"""Decimals of papers' tables, and of numbers of which no interval says how sure they are."""
+"""Decimals of papers' tables, and of numbers without an interval."""
 BEGIN, END = (
     "<!-- benchmark {name}: begin, written by `facediff benchmark report` -->",
     "<!-- benchmark {name}: end -->",
@@ -87,9 +87,9 @@ class Scale:
         plain = not magnitudes or (min(magnitudes) >= 0.01 and max(magnitudes) < 1000)
         exponent = 0 if plain else _magnitude(min(magnitudes))
         widths = [(interval.high - interval.low) / 2 for interval in intervals if interval is not None]
-        places = [1 - _magnitude(width) for width in widths if width > 0 and math.isfinite(width)]
-        places += [-_magnitude(deviation) for deviation in deviations if deviation]
-        return cls(exponent, min(max(exponent + max(places), 0), MOST_DIGITS) if places else MOST_DIGITS)
+        decimals = [1 - _magnitude(width) for width in widths if width > 0 and math.isfinite(width)]
+        decimals += [-_magnitude(deviation) for deviation in deviations if deviation]
+        return cls(exponent, min(max(exponent + max(decimals), 0), MOST_DIGITS) if decimals else MOST_DIGITS)
 
     def number(self, value: float | None, digits: int | None = None, sign: str = "") -> str:
         """A number without its power of ten, with the column's decimals if none are given."""
@@ -136,7 +136,7 @@ def arrow(better: str | None) -> str:
 
 
 def cost_cells(row: TableRow, costs: Sequence[str]) -> list[str]:
-    """Those of weights, speed, training time and memory that a table shows."""
+    """The table's cells of weights, speed, training time and memory."""
     cost = row.cost
     cells = {
         "weights": NONE if cost.parameters is None else f"{cost.parameters / 1e6:.2f} M",
@@ -160,7 +160,7 @@ def mean_and_deviation(row: TableRow, column: str, scale: Scale) -> str:
 
 
 def document(report: BenchmarkReport, drawings: Mapping[str, Drawing] | None = None) -> list[Block]:
-    """The whole report, with plots of :func:`plots` below the table that they belong to."""
+    """The whole report, with the plots of :func:`plots` below their tables."""
     outline = report.outline
     return [
         Title(outline.title),
@@ -173,8 +173,8 @@ def body(report: BenchmarkReport, drawings: Mapping[str, Drawing]) -> list[Block
     """The report without its title."""
     blocks: list[Block] = []
     if any(table.synthetic for table in report.tables):
-        blocks.append(Paragraph("Synthetic data: what follows says nothing about real people.", warning=True))
-    for place, table in enumerate(report.tables):
+        blocks.append(Paragraph("Synthetic data: these results are not about real people.", warning=True))
+    for number, table in enumerate(report.tables):
         facts = f"{table.frames} frames, {table.sequences} sentences"
         regions = [
             f"{part} {facts_of_part['count']} vertices (hash {facts_of_part['hash']})"
@@ -184,36 +184,33 @@ def body(report: BenchmarkReport, drawings: Mapping[str, Drawing]) -> list[Block
         notes = [f"{facts}; {', '.join(regions)}" if regions else facts, *table.notes]
         notes += [f"printed figures: {source}" for source in table.published.sources] + list(table.published.reasons)
         blocks += [Title(table.title, 2), main_table(table, printed=True), *details(table, report), Bullets(notes)]
-        blocks += [drawing for name, drawing in drawings.items() if name.startswith(f"{place}_")]
+        blocks += [drawing for name, drawing in drawings.items() if name.startswith(f"{number}_")]
     definitions = [line.strip() for line in report.definition.splitlines() if line.strip()]
-    return [*blocks, Title("What the numbers are", 2), Bullets(about(report)), Bullets(definitions)]
+    return [*blocks, Title("Definitions", 2), Bullets(about(report)), Bullets(definitions)]
 
 
 def main_table(table: Table, *, printed: bool = False, level: float | None = None, caption: str = "") -> ReportTable:
     """Scores and costs of every row.
 
-    Args:
-        table: of one corpus and split.
-        printed: whether the figures of papers stand next to ours.
-        level: puts a star behind what differs from the baseline at this level; no stars if None.
-        caption: in LaTeX.
+    Papers' figures stand next to them if ``printed``; a star marks significant differences from the baseline at
+    ``level``, unless it is None.
     """
     scale = scales(table)
     figures = table.published.scores
     paper = [column for column in table.columns if any(column in row for row in figures.values())] if printed else []
     rows: list[list[str]] = []
     marks: dict[tuple[int, int], str] = {}
-    for place, row in enumerate(table.rows):
+    for index, row in enumerate(table.rows):
         cells = [mean_and_deviation(row, column, scale[column]) for column in table.columns]
         if level is not None:
             starred = [row.significant(column, level) for column in table.columns]
             cells = [cell + "*" * star for cell, star in zip(cells, starred, strict=True)]
         cells += [scale[column].number(figures.get(row.name, {}).get(column), MOST_DIGITS) for column in paper]
         rows.append([row.label, *cells, NONE if not row.seeds else str(len(row.seeds)), *cost_cells(row, table.costs)])
-        marks |= {(place, number): row.marks.get(column, "") for number, column in enumerate(table.columns, 1)}
+        marks |= {(index, number): row.marks.get(column, "") for number, column in enumerate(table.columns, 1)}
     head = ["", *(head_of(column, scale[column]) + arrow(better) for column, better in table.columns.items())]
     head += [*(f"{title_of(column)}, printed" for column in paper), "runs", *map(title_of, table.costs)]
-    references = frozenset(place for place, row in enumerate(table.rows) if row.reference)
+    references = frozenset(index for index, row in enumerate(table.rows) if row.reference)
     return ReportTable(head, rows, marks, references, caption)
 
 
@@ -245,18 +242,18 @@ def comparison_rows(table: Table, report: BenchmarkReport) -> list[list[str]]:
     rows = []
     for row in table.rows:
         for column, (difference, adjusted) in row.differences.items():
-            own = scale[column]
+            form = scale[column]
             star = "*" if row.significant(column, report.bootstrap.level) else ""
-            cells = [row.label, title_of(column), own.number(difference.value, sign="+")]
-            chances = (difference.sentences, difference.runs, difference.both)
-            cells += [own.interval(interval, sign="+") for interval in chances]
+            cells = [row.label, title_of(column), form.number(difference.value, sign="+")]
+            chances = (difference.sentences, difference.runs, difference.total)
+            cells += [form.interval(interval, sign="+") for interval in chances]
             cells += [p_value(difference.p), p_value(adjusted), star]
             rows.append(cells)
     return rows
 
 
 def about(report: BenchmarkReport) -> list[str]:
-    """What the tables' signs mean, and where they come from."""
+    """The meaning of the tables' signs, and the versions that computed them."""
     boot = report.bootstrap
     alpha = 1 - boot.level
     lines = [
@@ -269,7 +266,7 @@ def about(report: BenchmarkReport) -> list[str]:
         "the references",
         f"a star, bold (best) and underlined (second best): corrected p below {alpha:.2g}; best and second best only "
         f"where they differ so from every row behind them, corrected for those alone; references are never marked; "
-        f"where nothing is marked, the data do not say which is best",
+        f"without marks, the data do not show which is best",
         "still face and mean face never move; shuffled speech is the model given another sentence's speech",
     ]
     factors = [row.cost.factor for table in report.tables for row in table.rows if row.cost.factor is not None]
@@ -286,7 +283,7 @@ def about(report: BenchmarkReport) -> list[str]:
     lines += report.remarks
     if not has_matplotlib():
         lines.append("plots are left out: matplotlib is not installed; `pip install 'facediff[figures]'`, write again")
-    lines += [f"no result yet: {name}" for name in report.missing]
+    lines += [f"no result yet: {name}" for name in report.pending]
     lines += [f"failed: {problem}" for problem in report.failed]
     codes = sorted({" ".join(result.code.values()) for result in report.results if result.code})
     lines.append(
@@ -313,15 +310,10 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
     """Put the tables into a Markdown page, between two comments that bear the plan's name."""
     name = report.outline.name
     begin, end = BEGIN.format(name=name), END.format(name=name)
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:  # as its lines end
-            text = stream.read()
-    except UnicodeDecodeError as error:
-        raise FaceDiffError(f"{path}: is not UTF-8 (byte {error.start}); save it as UTF-8") from error
+    with path.open(encoding="utf-8", newline="") as stream:  # keeps its line ends
+        text = stream.read()
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(end) < text.index(begin):
-        raise FaceDiffError(
-            f"{path}: has no place for {name}; write the two lines  {begin}  and  {end}  where it shall be"
-        )
+        raise FaceDiffError(f"{path}: has no block for {name}; add the two lines  {begin}  and  {end}  to the page")
     # Headings of the page stand above those of the tables.
     blocks = body(report, {})
     lowered = [replace(block, level=block.level + 1) if isinstance(block, Title) else block for block in blocks]
@@ -335,7 +327,7 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
 # CSV.
 
 NOTHING = Difference(0.0, None, None, None, None, None, None, 0)
-"""Of the row that all others are compared with."""
+"""For the row that all others are compared with."""
 
 
 def csv_rows(report: BenchmarkReport) -> list[dict[str, Any]]:
@@ -367,7 +359,7 @@ def _csv_row(report: BenchmarkReport, table: Table, row: TableRow, column: str, 
         "p_sentences": difference.p_sentences,
         **ends("difference_runs", difference.runs),
         "p_runs": difference.p_runs,
-        **ends("difference_both", difference.both),
+        **ends("difference_both", difference.total),
         "p": difference.p,
         "p_corrected": adjusted,
         "printed": table.published.scores.get(row.name, {}).get(column),
@@ -382,8 +374,8 @@ def plots(report: BenchmarkReport) -> dict[str, Drawing]:
     if not has_matplotlib():
         return {}
     return {
-        f"{place}_{table.corpus}_{table.split}_{name}": drawing
-        for place, table in enumerate(report.tables)
+        f"{number}_{table.corpus}_{table.split}_{name}": drawing
+        for number, table in enumerate(report.tables)
         for name, drawing in plots_of(table, report).items()
     }
 

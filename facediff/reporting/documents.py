@@ -1,7 +1,7 @@
 """One document, written as Markdown, as a page for the browser, as LaTeX, and as text for the terminal.
 
-A document is a list of blocks. Cells of tables are plain text, in which nothing is markup: each form escapes what is
-special in it. A cell that is None becomes –.
+A document is a list of blocks. Cells of tables are plain text without markup: each form escapes its special characters.
+A cell that is None becomes –.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ svg { max-width: 100%; height: auto; background: #fff; }
 
 @dataclass(frozen=True)
 class Title:
-    """A title of a level; that of the whole document has level 1."""
+    """A title; level 1 is the document's."""
 
     text: str
     level: int = 1
@@ -63,7 +63,7 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A plot as SVG, with what stands below it. Only a page for the browser shows it."""
+    """A plot as SVG, with its caption. Only a page for the browser shows it."""
 
     svg: str
     caption: str
@@ -92,10 +92,10 @@ class ReportTable:
         emphasis = EMPHASIS.get(form, {})
         return [
             [
-                emphasis.get(self.marks.get((place, column), ""), "{}").format(escape(NONE if cell is None else cell))
+                emphasis.get(self.marks.get((index, column), ""), "{}").format(escape(NONE if cell is None else cell))
                 for column, cell in enumerate(row)
             ]
-            for place, row in enumerate(self.rows)
+            for index, row in enumerate(self.rows)
         ]
 
 
@@ -139,8 +139,8 @@ def _markdown(block: Block) -> str:
             return "\n".join(f"- {markdown_text(line)}" for line in block.lines)
         case ReportTable():
             rows = block.cells("markdown", markdown_text)
-            for place in block.references:
-                rows[place][0] = f"*{rows[place][0]}*"
+            for index in block.references:
+                rows[index][0] = f"*{rows[index][0]}*"
             return _markdown_lines([markdown_text(title) for title in block.head], rows)
         case Drawing():
             return ""
@@ -164,7 +164,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
 
 
 def markdown_text(text: object) -> str:
-    r"""Text that Markdown shows as it is; what stands between backticks is code, in which only bars are special.
+    r"""Text that Markdown shows as it is; text between backticks is code, in which only bars are special.
 
     Example:
         >>> print(markdown_text("`a_b|c` and x_y"))
@@ -173,10 +173,8 @@ def markdown_text(text: object) -> str:
     parts = printable(text).split("`")
     if len(parts) % 2 == 0:
         parts = ["`".join(parts)]
-    for place in range(0, len(parts), 2):
-        parts[place] = re.sub(r"([\\|<>*_`\[\]]|^#)", r"\\\1", parts[place])
-    for place in range(1, len(parts), 2):
-        parts[place] = parts[place].replace("|", "\\|")
+    for index, part in enumerate(parts):
+        parts[index] = part.replace("|", "\\|") if index % 2 else re.sub(r"([\\|<>*_`\[\]]|^#)", r"\\\1", part)
     return "`".join(parts)
 
 
@@ -254,10 +252,10 @@ def _html(block: Block) -> str:
 def _html_table(table: ReportTable) -> str:
     titles = "".join(f'<th scope="col">{html_text(title)}</th>' for title in table.head)
     lines = []
-    for place, row in enumerate(table.cells("html", html_text)):
-        marks = [table.marks.get((place, column), "") for column in range(len(row))]
+    for index, row in enumerate(table.cells("html", html_text)):
+        marks = [table.marks.get((index, column), "") for column in range(len(row))]
         cells = [f"<td{_css(mark)}>{cell}</td>" for mark, cell in zip(marks, row, strict=True)]
-        lines.append(f"<tr{_css('reference' if place in table.references else '')}>{''.join(cells)}</tr>")
+        lines.append(f"<tr{_css('reference' if index in table.references else '')}>{''.join(cells)}</tr>")
     body = "\n".join(lines)
     return f'<div class="scroll"><table><thead><tr>{titles}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
 

@@ -56,7 +56,7 @@ def has_matplotlib() -> bool:
 def drawing_settings(font: str = FONT) -> Iterator[None]:
     """Settings of matplotlib for drawing and saving a figure; the caller's own are restored afterwards."""
     package = matplotlib()
-    chosen = {
+    settings = {
         "font.family": [font],
         "font.size": TEXT,
         "axes.labelsize": TEXT,
@@ -78,7 +78,7 @@ def drawing_settings(font: str = FONT) -> Iterator[None]:
     }
     with package.rc_context(), warnings.catch_warnings():
         package.rcdefaults()  # a matplotlibrc of the user's must not change the figure
-        package.rcParams.update(chosen)
+        package.rcParams.update(settings)
         yield
 
 
@@ -108,8 +108,8 @@ def plot_svg(draw: Callable[[Axes], None], label: str, *, width: float = 4.8, he
     """A plot as an SVG element for a page; equal plots give equal text.
 
     Args:
-        draw: draws into the axes. What it labels is named in a legend below them.
-        label: what is shown, for those who cannot see it.
+        draw: draws into the axes. Its labels form a legend below them.
+        label: a description for readers who cannot see it.
         width: in inches.
         height: of the plot in inches; a legend is added to it.
     """
@@ -122,8 +122,8 @@ def plot_svg(draw: Callable[[Axes], None], label: str, *, width: float = 4.8, he
         handles, names = axes.get_legend_handles_labels()
         if names:
             figure.set_figheight(height + 0.19 * -(-len(names) // 2))
-            short = [plain(name[:LONGEST_LABEL]) for name in names]
-            figure.legend(handles, short, loc="outside lower left", ncols=2)
+            labels = [plain(name[:LONGEST_LABEL]) for name in names]
+            figure.legend(handles, labels, loc="outside lower left", ncols=2)
         # The browser draws the letters: those that matplotlib's font lacks are no fault.
         warnings.filterwarnings("ignore", r"Glyph \d+ .*missing", UserWarning)
         content = io.StringIO()

@@ -12,7 +12,7 @@ from facediff.reporting.statistics import Array, Bootstrap, Interval, pooled
 
 @dataclass(frozen=True)
 class ScoreMatrix:
-    """Scores of clips, and how much each counts.
+    """Scores of clips, and their weights.
 
     Attributes:
         clips: names of the rows.
@@ -39,12 +39,12 @@ class ScoreMatrix:
         """Clips that have a value in some column."""
         return [self.clips[row] for row in np.flatnonzero((self.weights > 0).any(1))]
 
-    def common(self, other: ScoreMatrix) -> tuple[ScoreMatrix, ScoreMatrix]:
-        """Both tables with the clips that both have; one that has no value in a column of one counts in neither."""
-        clips = [clip for clip in self.clips if clip in set(other.clips)]
-        one, two = self.at(clips), other.at(clips)
-        both = (one.weights > 0) & (two.weights > 0)
-        return replace(one, weights=one.weights * both), replace(two, weights=two.weights * both)
+    def common(self, matrix: ScoreMatrix) -> tuple[ScoreMatrix, ScoreMatrix]:
+        """Both tables with their common clips; a clip without a value in a column of one counts in neither."""
+        clips = [clip for clip in self.clips if clip in set(matrix.clips)]
+        one, two = self.at(clips), matrix.at(clips)
+        valued = (one.weights > 0) & (two.weights > 0)
+        return replace(one, weights=one.weights * valued), replace(two, weights=two.weights * valued)
 
     def pool(self) -> Array:
         """The score of each column; NaN where no clip has a value."""

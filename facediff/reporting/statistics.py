@@ -1,7 +1,7 @@
-"""How sure a number is: intervals by resampling, intervals of shares, and tests of differences.
+"""Intervals by resampling, intervals of shares, and tests of differences.
 
-SciPy has the distributions. The bootstrap and the permutations are written out here: a score is a ratio of sums whose
-sequences keep the weight of their frames, and the random numbers are those of the seed that a report states.
+SciPy has the distributions. The bootstrap and the permutations are written out here: a score is a ratio of sums in
+which sequences keep the weight of their frames, and the random numbers follow from the seed that a report states.
 """
 
 from __future__ import annotations
@@ -88,9 +88,9 @@ class Bootstrap:
         """The middle of the scores of the resamples (resamples, columns), for each column."""
         if scores is None:
             return [None] * columns
-        places = [(1 - self.level) / 2, (1 + self.level) / 2]
+        ends = [(1 - self.level) / 2, (1 + self.level) / 2]
         valued = [column[~np.isnan(column)] for column in scores.T]
-        return [Interval(*np.quantile(column, places).tolist()) if len(column) else None for column in valued]
+        return [Interval(*np.quantile(column, ends).tolist()) if len(column) else None for column in valued]
 
 
 def sign_flip(differences: Array, *, seed: int = 0) -> float:
@@ -99,7 +99,7 @@ def sign_flip(differences: Array, *, seed: int = 0) -> float:
     Exact for few sentences; with more, the observed signs count as one of the random ones, so that p is never 0.
 
     Args:
-        differences: what each sentence adds to the difference (sentences,).
+        differences: the part of each sentence in the difference (sentences,).
         seed: of the random signs.
 
     Example:
@@ -191,7 +191,7 @@ def share_between_raters(
 ) -> tuple[float, float]:
     """Percentile interval of a share over raters that are drawn again with replacement.
 
-    Answers of one rater are alike, which intervals of single answers do not know; this one takes raters as they come.
+    Unlike intervals of single answers, it accounts for the similarity of one rater's answers.
 
     Args:
         wins: of each rater (R,).
@@ -204,9 +204,9 @@ def share_between_raters(
         return 0.0, 1.0
     if len(counts) < 2 or not resamples:
         return math.nan, math.nan
-    drawn = np.random.default_rng(seed).multinomial(len(counts), np.full(len(counts), 1 / len(counts)), resamples)
-    totals = drawn @ counts
-    shares = (drawn @ wins)[totals > 0] / totals[totals > 0]
+    samples = np.random.default_rng(seed).multinomial(len(counts), np.full(len(counts), 1 / len(counts)), resamples)
+    totals = samples @ counts
+    shares = (samples @ wins)[totals > 0] / totals[totals > 0]
     lower, upper = np.quantile(shares, [(1 - level) / 2, (1 + level) / 2])
     return float(lower), float(upper)
 
@@ -224,7 +224,7 @@ def holm(values: Sequence[float]) -> list[float]:
     order = np.argsort(values, kind="stable")
     adjusted = [0.0] * len(values)
     highest = 0.0
-    for place, index in enumerate(order.tolist()):
-        highest = max(highest, min(1.0, (len(values) - place) * values[index]))
+    for rank, index in enumerate(order.tolist()):
+        highest = max(highest, min(1.0, (len(values) - rank) * values[index]))
         adjusted[index] = highest
     return adjusted

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from facediff.benchmark.referee import FAULTS, Judgement, Tally, judge
+from facediff.benchmark.referee import FAULTS, Judgement, RefereeScores, judge
 from facediff.pipelines.candidates import Candidate, CandidateMotion, perform
 from facediff.synthetic.spoken_set import SpokenClip, SpokenMotion, open_face, reference, spoken_set
 from facediff.utils.hub import BUNDLED
@@ -33,11 +33,11 @@ def test_the_planted_faults_of_the_bundled_model_are_seen_by_every_score_that_is
 
 
 def test_the_reference_scores_as_itself() -> None:
-    tally = Tally(25.0)
+    scores = RefereeScores(25.0)
     for clip in clips():
         truth = reference(clip, 25.0)
-        tally.add(clip, truth, truth)
-    scores = tally.scores()
+        scores.add(clip, truth, truth)
+    scores = scores.scores()
     for name in ("closures", "correlation", "lips", "jitter", "step", "upper_face"):
         assert scores[name] == pytest.approx(1.0, abs=1e-6), name
     assert scores["lag"] == pytest.approx(0.0, abs=1e-6)
@@ -49,14 +49,14 @@ def test_a_known_delay_gap_and_turn_are_measured() -> None:
     clip, face = clips()[0], open_face()
     truth = reference(clip, 50.0)
     late = SpokenMotion(np.concatenate([truth.points[:1]] * 3 + [truth.points[:-3]]), None)
-    tally = Tally(50.0)
-    tally.add(clip, late, truth)
-    assert tally.scores()["lag"] == pytest.approx(60.0, abs=2)
+    scores = RefereeScores(50.0)
+    scores.add(clip, late, truth)
+    assert scores.scores()["lag"] == pytest.approx(60.0, abs=2)
     points = np.repeat(face.rest[None], len(truth.points), 0)
     points[:, face.lip_pairs[:, 1], 1] -= 0.003
     turns = np.zeros((len(points), 3))
     turns[::2, 1] = np.deg2rad(4)
-    open_mouth = Tally(50.0)
+    open_mouth = RefereeScores(50.0)
     open_mouth.add(clip, SpokenMotion(points, turns), truth)
     scores = open_mouth.scores()
     assert scores["gap"] == pytest.approx(3.0, abs=0.5)

@@ -62,7 +62,7 @@ def test_of_two_rows_without_training_a_score_that_is_no_mean_has_no_p() -> None
     still, other = (RowScores(np.array([value]), fixed=True) for value in (0.7, 0.5))
     trained = RowScores(np.array([0.6, 0.4, 0.5]))
     gap = difference(still, other, BOOTSTRAP)
-    assert (gap.value, gap.p, gap.both) == (pytest.approx(0.2), None, None)
+    assert (gap.value, gap.p, gap.total) == (pytest.approx(0.2), None, None)
     assert difference(trained, still, BOOTSTRAP).p == welch(trained, still)[0]
 
 
@@ -106,9 +106,9 @@ def test_a_difference_is_that_of_the_pooled_scores_over_common_sentences() -> No
     found = difference(one, other, BOOTSTRAP)
     assert found.value == pytest.approx(one.mean - other.mean)
     assert found.p == scipy_both(first, second, frames)
-    assert found.both is not None
+    assert found.total is not None
     means = [np.average(values, axis=1, weights=frames).mean() for values in (first, second)]
-    assert found.both.low < means[0] - means[1] < found.both.high
+    assert found.total.low < means[0] - means[1] < found.total.high
     less = difference(one, scores(second[:, 3:], frames[3:], clips=[*map(str, range(3, 12))]), BOOTSTRAP)
     assert less.common == 9
     mine, theirs = (np.average(values[:, 3:], axis=1, weights=frames[3:]).mean() for values in (first, second))

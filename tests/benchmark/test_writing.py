@@ -65,7 +65,7 @@ def test_a_single_seed_is_said_and_nothing_is_marked() -> None:
     (table,) = report.tables
     assert not any(row.marks for row in table.rows)
     assert not any(row.significant("lve", 0.95) for row in table.rows if not row.reference)
-    assert "one training run" in table.notes[0]
+    assert "a single training run" in table.notes[0]
 
 
 def test_a_method_that_a_still_face_beats_is_noted() -> None:
@@ -96,7 +96,7 @@ def test_a_method_that_ignores_its_speech_is_named() -> None:
         assert [row.label for row in table.rows if row.reference] == [
             *("still face", "Method 0, shuffled speech", "Method 1, shuffled speech", "Method 2, shuffled speech")
         ]
-        said = "by lve, another sentence's speech does as well as the own: Method 1, Method 2"
+        said = "by lve, another sentence's speech gives equal scores: Method 1, Method 2"
         assert said in table.notes
 
 
@@ -173,9 +173,6 @@ def test_the_block_of_a_page_is_replaced_and_the_rest_stays(tmp_path: Path) -> N
     assert file.read_bytes() == windows.replace(b"last", b"the last")
     file.write_text("nothing\n")
     with pytest.raises(FaceDiffError, match="made"):
-        replace_block(file, made())
-    file.write_bytes(once.replace("Title", "Straße").encode("latin-1", "replace"))
-    with pytest.raises(FaceDiffError, match=r"page\.md: is not UTF-8 \(byte 6\)"):
         replace_block(file, made())
 
 
