@@ -1,4 +1,4 @@
-"""What raters answer: checked before anything is done with it, whether it comes from a file or over the network."""
+"""The answers of raters, checked where they enter: from a file or over the network."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Rater:
 
 @dataclass(frozen=True)
 class AnswerFile:
-    """What the page writes of a rater."""
+    """The page's file of a rater."""
 
     rater: Token
     number: Annotated[int, Range(0, 10**9)]
@@ -86,7 +86,7 @@ class AnswerFile:
 
 @dataclass(frozen=True)
 class Registration:
-    """What the page sends when a rater begins."""
+    """The page's message when a rater begins."""
 
     rater: Token
     language: Language
@@ -96,16 +96,16 @@ class Registration:
 
 @dataclass(frozen=True)
 class RatingsEnd:
-    """What the page sends when a rater ends."""
+    """The page's message when a rater ends."""
 
     rater: Token
     comments: Comments = field(default_factory=dict)
 
 
-def read_answers(path: Path, study: Study, others: Collection[str] = ()) -> Rater | None:
-    """The answers that a rater has downloaded; None if they belong to one of ``others``, ids of other studies."""
+def read_answers(path: Path, study: Study, ignored: Collection[str] = ()) -> Rater | None:
+    """The answers that a rater has downloaded; None if they belong to an ignored study, given by its id."""
     content = load_json(path, remedy="expected a file that the study's page has made")
-    if isinstance(content, dict) and content.get("study") in others:
+    if isinstance(content, dict) and content.get("study") in ignored:
         return None
     return check_rater(content, study, path)
 
@@ -118,10 +118,10 @@ def check_rater(content: object, study: Study, source: object) -> Rater:
     answers: dict[str, Answer] = {}
     for answer in read.trials:
         check_answer(answer, study, read.number, source)
-        answers.setdefault(answer.trial, answer)  # what was submitted twice counts once, as first given
-    finished = read.finished if len(answers) >= len(study.trials_of(read.number)) else None
+        answers.setdefault(answer.trial, answer)  # the first of repeated answers counts
+    end = read.finished if len(answers) >= len(study.trials_of(read.number)) else None
     comments = check_comments(read.comments, study, source)
-    return Rater(read.rater, read.number, read.language, clean(read.code), read.started, finished, answers, comments)
+    return Rater(read.rater, read.number, read.language, clean(read.code), read.started, end, answers, comments)
 
 
 def check_study(content: object, study: Study, source: object) -> None:
@@ -134,17 +134,16 @@ def check_study(content: object, study: Study, source: object) -> None:
 def check_answer(answer: Answer, study: Study, number: int, source: object) -> None:
     """Refuse answers that the study does not ask of a rater of that number."""
     trial = next((trial for trial in study.trials_of(number) if trial.id == answer.trial), None)
-    asked = {} if trial is None else asked_of(study, trial)
-    fits = answer.answers.keys() == asked.keys() and all(answer.answers[name] in asked[name] for name in asked)
-    if not asked or not fits:
-        questions = "; ".join(f"{name}: {' or '.join(answers)}" for name, answers in asked.items())
-        shown = f"{quoted(answer.trial)} with answers {quoted(dict(answer.answers))}"
-        expected = questions or "a trial that this rater is asked about"
-        raise FaceDiffError(f"{source}: trial is {shown}; expected {expected}")
+    allowed = {} if trial is None else questions_of(study, trial)
+    fits = answer.answers.keys() == allowed.keys() and all(answer.answers[name] in allowed[name] for name in allowed)
+    if not allowed or not fits:
+        questions = "; ".join(f"{name}: {' or '.join(answers)}" for name, answers in allowed.items())
+        entry = f"{quoted(answer.trial)} with answers {quoted(dict(answer.answers))}"
+        raise FaceDiffError(f"{source}: trial is {entry}; expected {questions or 'a trial of this rater'}")
 
 
-def asked_of(study: Study, trial: Trial) -> dict[str, Sequence[str]]:
-    """The answers to each question that is asked of a trial."""
+def questions_of(study: Study, trial: Trial) -> dict[str, Sequence[str]]:
+    """The allowed answers to each question about a trial."""
     return {
         question.name: question.answers
         for question in study.choices
@@ -156,8 +155,8 @@ def check_comments(comments: Mapping[str, str], study: Study, source: object) ->
     """Free texts by question; empty ones are left out."""
     fields = {question.name for question in study.questions if question.kind == "text"}
     if not comments.keys() <= fields:
-        known = ", ".join(sorted(fields)) or "none"
-        raise FaceDiffError(f"{source}: comments are {quoted(dict(comments))}; expected texts for {known}")
+        expected = ", ".join(sorted(fields)) or "none"
+        raise FaceDiffError(f"{source}: comments are {quoted(dict(comments))}; expected texts for {expected}")
     return {name: cleaned for name, text in comments.items() if (cleaned := clean(text))}
 
 
@@ -170,7 +169,7 @@ def clean(text: str) -> str:
 
 
 def merge(groups: Iterable[Iterable[Rater]]) -> list[Rater]:
-    """Raters of several sources, each once: what one source has of a rater in addition is added to the first."""
+    """Raters of several sources, each once: answers that a later source has in addition are added to the first."""
     raters: dict[str, Rater] = {}
     for rater in (rater for group in groups for rater in group):
         earlier = raters.get(rater.token)

@@ -1,4 +1,4 @@
-"""What a study is: its questions, trials, schedules and its rule of exclusion, as ``study.json`` states them.
+"""The definition of a study: questions, trials, schedules and the rule of exclusion, as in ``study.json``.
 
 The file is the key of the study: it says which method is on which side, so that raters get the page only.
 """
@@ -23,7 +23,7 @@ from facediff.utils.records import Items, Text, read_record
 
 FORMAT = "facediff study 1"
 STUDY_FILE, PAGE_FOLDER, VIDEO_FOLDER, DATABASE = "study.json", "page", "videos", "answers.sqlite"
-"""What is in the folder of a study."""
+"""Files and folders of a study."""
 
 Name = Annotated[str, Text(r"[a-z][a-z0-9_]{0,39}", "small letters, digits and underscores")]
 Language = Annotated[str, Text(r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})?", "a code such as en")]
@@ -38,7 +38,7 @@ Texts = Mapping[Language, Line]
 
 @dataclass(frozen=True)
 class Question:
-    """What a rater is asked.
+    """A question to raters.
 
     Attributes:
         name: its name in answers and tables.
@@ -62,7 +62,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Rule:
-    """Whose answers are not counted; fixed when the study is made.
+    """The rule of exclusion of raters; fixed when the study is made.
 
     Attributes:
         least_right: share of the answers to controls of the truth against a still face that name the truth.
@@ -82,7 +82,7 @@ class Trial:
     """A video that raters are asked about.
 
     Attributes:
-        id: its name in answers, which says nothing about what it shows.
+        id: its name in answers, which does not reveal its conditions.
         kind: ``pair``, or a control: ``still``, ``same`` or ``repeat`` (see :class:`facediff.study.design.Showing`).
         clip: the clip's name.
         left: condition on the left.
@@ -99,7 +99,7 @@ class Trial:
     video: Video
     reference: Video | None = None
 
-    def chosen(self, answer: str) -> str | None:
+    def preferred(self, answer: str) -> str | None:
         """The condition that an answer names; None for no difference."""
         return {LEFT: self.left, RIGHT: self.right}.get(answer)
 
@@ -113,13 +113,13 @@ class Study:
         consent: what raters agree to, by language.
         languages: the page's languages; the first is the default.
         methods: the methods; the first is the one that the others are compared with.
-        questions: what is asked, in order.
-        rule: whose answers are not counted.
+        questions: the questions, in order.
+        rule: of exclusion.
         trials: all videos that are asked about.
         schedules: for rater after rater, the numbers of the trials in order.
         seed: of the design.
         remark: stands below every video, such as that the corpus is synthetic.
-        details: what else is known: options and files.
+        details: options and files.
         version: of facediff.
     """
 
@@ -138,7 +138,7 @@ class Study:
 
     @cached_property
     def id(self) -> str:
-        """Follows from all that raters see and answer, so that answers to another study are noticed."""
+        """Hash of everything that raters see and answer, so that answers to another study are noticed."""
         content = self.as_dict() | {"details": {}, "version": ""}
         text = json.dumps(content, sort_keys=True, ensure_ascii=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -160,17 +160,12 @@ class Study:
         return [question for question in self.questions if question.kind == "choice"]
 
     def trials_of(self, rater: int) -> list[Trial]:
-        """What a rater sees, in order.
-
-        Args:
-            rater: the rater's number, from 0.
-        """
+        """The trials of a rater, numbered from 0, in order."""
         return [self.trials[index] for index in self.schedules[rater % len(self.schedules)]]
 
     def videos(self) -> list[str]:
         """Names of all videos."""
-        named = [name for trial in self.trials for name in (trial.video, trial.reference) if name]
-        return sorted(set(named))
+        return sorted({name for trial in self.trials for name in (trial.video, trial.reference) if name})
 
     def as_dict(self) -> dict[str, Any]:
         """The content of the file, without the id."""
@@ -190,11 +185,11 @@ def read_study(folder: Path) -> Study:
     check_format(path, content.get("format") if isinstance(content, dict) else None, FORMAT)
     study = read_record(Study, content, path, remedy=remedy, strict=False)
     last = len(study.trials) - 1
-    if not study.choices or not study.schedules or not all(row and max(row) <= last for row in study.schedules):
-        raise FaceDiffError(f"{path}: asks for no choice, or for trials that it does not have; {remedy}")
+    problem = ""
     if content.get("id") != study.id:
-        raise FaceDiffError(
-            f"{path}: has been changed since the study was made, so that answers may not belong to it; make the "
-            f"study again in a new folder"
-        )
+        problem = "was changed after the study was made, and answers may not belong to it; make the study again"
+    if not study.choices or not study.schedules or not all(row and max(row) <= last for row in study.schedules):
+        problem = f"has no choice, or lacks trials of its schedules; {remedy}"
+    if problem:
+        raise FaceDiffError(f"{path}: {problem}")
     return study

@@ -22,17 +22,17 @@ Pairs = Literal["first", "all"]
 Kind = Literal["pair", "still", "same", "repeat"]
 
 TRUTH, STILL = "truth", "still"
-"""Conditions that are no methods: the recording, and a face that does not move."""
+"""Conditions besides the methods: the recording, and a face that does not move."""
 MOST_TRIALS = 200
 """Trials of a rater; more would take hours, and the list of schedules would fill the page."""
 
 
 @dataclass(frozen=True, order=True)
 class Showing:
-    """A video that a rater is asked about: a clip with a condition on each side.
+    """A video of a trial: a clip with a condition on each side.
 
     Attributes:
-        kind: ``pair`` is what the study is about; the others are controls: the truth against a still face, the same
+        kind: ``pair`` is the comparison of the study; the others are controls: the truth against a still face, the same
             animation on both sides, and a pair that the rater sees a second time with its sides exchanged.
         clip: the clip's name.
         left: condition on the left, a method, ``truth`` or ``still``.
@@ -51,7 +51,7 @@ class Showing:
 
 
 def make_pairs(conditions: Sequence[str], pairs: Pairs) -> list[tuple[str, str]]:
-    """The pairs that are compared: the first condition with each other one, or all with all.
+    """The compared pairs: the first condition with each other one, or all with all.
 
     Example:
         >>> make_pairs(["ours", "theirs", "truth"], "first")
@@ -59,7 +59,7 @@ def make_pairs(conditions: Sequence[str], pairs: Pairs) -> list[tuple[str, str]]
     """
     if pairs == "all":
         return list(combinations(conditions, 2))
-    return [(conditions[0], other) for other in conditions[1:]]
+    return [(conditions[0], condition) for condition in conditions[1:]]
 
 
 def make_forms(
@@ -76,21 +76,21 @@ def make_forms(
 
     Args:
         clips: names of the clips.
-        pairs: what is compared.
+        pairs: the comparisons.
         design: ``latin``, one pair of every clip in a form, or ``all``, every pair of every clip.
         still: controls of the truth against a still face in every form.
         same: controls of one animation on both sides.
         repeats: pairs that come a second time, with their sides exchanged.
-        seed: of which clips the controls show.
+        seed: of the controls' clips.
 
     Example:
         >>> forms = make_forms(["a", "b"], [("ours", "theirs")], design="latin", still=0, same=0, repeats=0, seed=0)
-        >>> [[(each.clip, each.left) for each in form] for form in forms]
+        >>> [[(video.clip, video.left) for video in form] for form in forms]
         [[('a', 'ours'), ('b', 'theirs')], [('a', 'theirs'), ('b', 'ours')]]
     """
     rng = np.random.default_rng(seed)
     control_clips = [clips[i] for i in rng.permutation(len(clips))]
-    shown = list(dict.fromkeys(name for pair in pairs for name in pair if name != TRUTH)) or [TRUTH]
+    methods = list(dict.fromkeys(name for pair in pairs for name in pair if name != TRUTH)) or [TRUTH]
     count = len(clips) * (1 if design == "latin" else len(pairs)) + still + same + repeats
     if count > MOST_TRIALS:
         raise FaceDiffError(
@@ -102,9 +102,9 @@ def make_forms(
             form = []
             for number, clip in enumerate(clips):
                 # Of the clips that a form shows with one pair, every second one has its sides exchanged.
-                chosen = [(number + shift) % len(pairs)] if design == "latin" else range(len(pairs))
+                indices = [(number + shift) % len(pairs)] if design == "latin" else range(len(pairs))
                 turn = number // len(pairs) if design == "latin" else number
-                for pair in chosen:
+                for pair in indices:
                     showing = Showing("pair", clip, *pairs[pair])
                     form.append(showing.mirrored if (turn + pair + mirror) % 2 else showing)
             again = [form[i] for i in rng.permutation(len(form))[:repeats]]
@@ -112,7 +112,7 @@ def make_forms(
                 control = Showing("still", control_clips[number % len(clips)], TRUTH, STILL)
                 form.append(control.mirrored if (number + mirror + shift) % 2 else control)
             for number in range(same):
-                name = shown[number % len(shown)]
+                name = methods[number % len(methods)]
                 form.append(Showing("same", control_clips[(still + number) % len(clips)], name, name))
             form += [Showing("repeat", pair.clip, pair.right, pair.left) for pair in again]
             forms.append(list(dict.fromkeys(form)))  # more controls than clips would ask for one video twice
@@ -122,13 +122,13 @@ def make_forms(
 def orders(count: int) -> list[list[int]]:
     """Rows of a balanced Latin square of Williams (1949): ``count`` rows, or twice as many where ``count`` is odd.
 
-    Every number stands in every place equally often, and follows every other number equally often.
+    Every number has every position equally often, and follows every other number equally often.
 
     Example:
         >>> orders(4)
         [[0, 3, 1, 2], [1, 0, 2, 3], [2, 1, 3, 0], [3, 2, 0, 1]]
     """
-    first = [place // 2 if place % 2 == 0 else count - 1 - place // 2 for place in range(count)]
+    first = [index // 2 if index % 2 == 0 else count - 1 - index // 2 for index in range(count)]
     rows = [[(number + row) % count for number in first] for row in range(count)]
     return rows if count % 2 == 0 else [*rows, *(row[::-1] for row in rows)]
 
@@ -149,6 +149,6 @@ def make_schedules(forms: Sequence[Sequence[Showing]], seed: int) -> tuple[list[
     for form in forms:
         mixed = [number[form[i]] for i in rng.permutation(len(form))]
         square = orders(len(form))
-        rows.append([[mixed[place] for place in square[i]] for i in rng.permutation(len(square))])
-    most = max(len(schedules) for schedules in rows)
-    return trials, [schedules[turn % len(schedules)] for turn in range(most) for schedules in rows]
+        rows.append([[mixed[index] for index in square[i]] for i in rng.permutation(len(square))])
+    turns = max(len(schedules) for schedules in rows)
+    return trials, [schedules[turn % len(schedules)] for turn in range(turns) for schedules in rows]

@@ -1,8 +1,8 @@
 """Making a study: clips and trials are chosen, videos are drawn, and the page and the key are written.
 
 Videos are a batch that can be stopped and continued (:mod:`facediff.utils.batch`); ``study.json`` is written last, so
-that a folder with it is complete. Names of videos follow from what they show, so that an earlier study in the same
-folder stays whole until the new one replaces it.
+that a folder with it is complete. Names of videos are hashes of their content, so that an earlier study in the same
+folder stays complete until the new one replaces it.
 """
 
 from __future__ import annotations
@@ -81,9 +81,9 @@ class StudyPlan:
     """A study whose files have been read and checked, before anything is written.
 
     Attributes:
-        study: what it asks.
+        study: its definition.
         clips: the clips by name.
-        notes: what was left out, and why.
+        notes: clips and questions that were left out, with the reasons.
     """
 
     options: StudyOptions
@@ -102,15 +102,15 @@ class StudyPlan:
     def minutes(self) -> float:
         """Minutes that a rater takes, if every video is seen once and every answer takes five seconds."""
         trials = self.study.trials_of(0)
-        asked = 5 * len(self.study.choices) * len(trials)
-        return (asked + sum(self.clips[trial.clip].seconds for trial in trials)) / 60
+        answering = 5 * len(self.study.choices) * len(trials)
+        return (answering + sum(self.clips[trial.clip].seconds for trial in trials)) / 60
 
     def make(
         self, output: Path, *, workers: int | None = None, scheduler: str | None = "", progress: bool = True
     ) -> int:
         """Draw the videos and write the page and the key; the number of videos that were drawn.
 
-        What an earlier run has drawn of the same files and options is kept.
+        Videos of an earlier run with the same files and options are kept.
 
         Args:
             output: the study's folder.
@@ -157,15 +157,15 @@ class StudyPlan:
 
 
 def check_output(output: Path, study: Study) -> None:
-    """Refuse a folder that holds anything but this study, or an earlier one that nobody has answered."""
+    """Refuse a folder with other content than this study, or an earlier one without answers."""
     check_folder_writable(output)
     if not output.exists():
         return
     inside = [*output.iterdir(), *(output / PAGE_FOLDER).glob("*")]
-    # What a run leaves that is killed before its first video is recorded.
-    begun = {output / LOCK, output / PAGE_FOLDER, output / PAGE_FOLDER / VIDEO_FOLDER}
-    own = (output / STUDY_FILE).is_file() or (output / RECORDS).is_dir()
-    if not own and any(path not in begun and ".partial-" not in path.name for path in inside):
+    # A run that is killed before its first video is recorded leaves these.
+    leftovers = {output / LOCK, output / PAGE_FOLDER, output / PAGE_FOLDER / VIDEO_FOLDER}
+    is_study = (output / STUDY_FILE).is_file() or (output / RECORDS).is_dir()
+    if not is_study and any(path not in leftovers and ".partial-" not in path.name for path in inside):
         raise FaceDiffError(f"{output}: is not empty, and holds no study; choose a new folder")
     if (output / DATABASE).exists():
         from facediff.study.store import count_raters, study_of
@@ -184,13 +184,13 @@ def plan_study(
     truth: Path | None = None,
     **sources: Any,  # noqa: ANN401 - passed on
 ) -> StudyPlan:
-    """Choose clips, trials and schedules, after reading and checking every file that is shown.
+    """Choose clips, trials and schedules, after reading and checking every file.
 
     Args:
         methods: each method's folder; the first is compared with the others and with the truth.
         options: how the study is made.
         truth: a corpus folder, a folder of animations, or ``puppet``; None for a study without truth.
-        sources: what else :class:`StudyAnimations` takes: ``references``, ``identity``, ``speech``, ``mesh``,
+        sources: further arguments of :class:`StudyAnimations`: ``references``, ``identity``, ``speech``, ``mesh``,
             ``frame_rate`` and ``unit``.
     """
     options = options or StudyOptions()
@@ -256,7 +256,7 @@ def choose_references(
     rng = np.random.default_rng([seed, 2])
     references = {name: material.reference(name, names, rng) for name in names}
     without = next((name for name, reference in references.items() if reference is None), None)
-    if without is not None and questionnaire.chosen:
+    if without is not None and questionnaire.named:
         raise FaceDiffError(
             f"{without}: has no reference, another clip of the same speaker, which a question needs; give them "
             f"with --style-references or --truth, or ask no question with reference: true"
@@ -265,7 +265,7 @@ def choose_references(
 
 
 def choose_clips(material: StudyAnimations, options: StudyOptions) -> list[str]:
-    """The clips that are asked for, or a seeded choice, evenly among the speakers."""
+    """The clips of the options, or a seeded choice, evenly among the speakers."""
     if options.clips is not None:
         for name in options.clips:
             if name not in material.clips:
@@ -282,7 +282,7 @@ def choose_clips(material: StudyAnimations, options: StudyOptions) -> list[str]:
 
 
 class Videos:
-    """The videos of a study, each once; names say nothing about what is shown, and change with it.
+    """The videos of a study, each once; their names are hashes of their content, and reveal nothing.
 
     Attributes:
         tasks: by name.
@@ -294,7 +294,7 @@ class Videos:
         self._digest = cache(sha256)
 
     def trial(self, showing: Showing, clip: StudyClip) -> Trial:
-        """A trial of a clip, with its video and that of its reference."""
+        """A trial of a clip, with its video and its reference's."""
         panels = tuple((clip.motion(condition), condition == STILL) for condition in (showing.left, showing.right))
         camera = Camera.framing(list(clip.templates), view=self.options.view)
         name = self._add(panels, camera, clip.colours, clip.sound, clip.frames)

@@ -29,11 +29,11 @@ UNEQUAL = 0.1
 
 @dataclass(frozen=True)
 class MotionFile:
-    """Where an animation comes from; picklable, and read where it is drawn.
+    """The file of an animation; picklable, and read where it is drawn.
 
     Attributes:
         path: .npz of ``facediff animate``, or .npy of vertices.
-        facts: what a bare array lacks.
+        facts: mesh, frame rate and unit of a bare array.
         stride: every n-th frame is used.
     """
 
@@ -44,15 +44,14 @@ class MotionFile:
     def read(self) -> Animation:
         """The animation; all of its frames are finite, and it can be drawn."""
         animation = read_animation(self.path, {}, self.facts)
-        if animation.faces is None:
-            raise FaceDiffError(f"{self.path}: comes without a mesh (triangles); give one with --mesh")
+        _ = animation.triangles  # refuses an animation without a mesh
         if self.stride > 1:
             animation = animation.part(slice(None, None, self.stride))
         animation.refuse_not_finite()
         return animation
 
     def digest(self) -> str:
-        """What of the facts decides pictures, as a checksum."""
+        """A checksum of the facts that pictures depend on."""
         checksum = hashlib.sha256(str(self.stride).encode())
         for name, value in sorted(self.facts.items()):
             checksum.update(name.encode())
@@ -92,7 +91,7 @@ class StudyClip:
         return self.frames / self.frame_rate
 
     def motion(self, condition: str) -> MotionFile:
-        """The motion that a condition shows; a still face is that of the truth, or else of the first method."""
+        """The motion of a condition; a still face is the truth's, or else the first method's."""
         if condition == STILL:
             return self.motions.get(TRUTH) or next(iter(self.motions.values()))
         return self.motions[condition]
@@ -106,9 +105,9 @@ class StudyAnimations:
         truth: a corpus folder, a folder of animations, or ``puppet``; None for a study without truth.
         references: folder of animations whose speakers' names begin the names of its files; the truth's other clips if
             None.
-        identity: whose style the predictions were given: ``own``, or an identity's name.
+        identity: the style of the predictions: ``own``, or an identity's name.
         speech: folder of recordings; the corpus's, or those that the animations hold, if None.
-        mesh: what bare arrays lack: a file with the triangles.
+        mesh: a file with the triangles of bare arrays.
         frame_rate: frames a second of bare arrays.
         unit: unit of length of bare arrays.
 
@@ -161,16 +160,16 @@ class StudyAnimations:
         self.clips = sorted(set.intersection(*sets))
         self.left_out = {name: sorted(set(files) - set(self.clips)) for name, files in self._files.items()}
         if not self.clips:
-            named = "; ".join(f"{name} has {few(dict.fromkeys(sorted(files)))}" for name, files in self._files.items())
+            clips = "; ".join(f"{name} has {few(dict.fromkeys(sorted(files)))}" for name, files in self._files.items())
             raise FaceDiffError(
-                f"there is no clip that all have: {named}. Name files alike: <clip>.npz, <clip>.npy or "
+                f"there is no common clip: {clips}. Name files alike: <clip>.npz, <clip>.npy or "
                 f"<clip>_condition_<identity>.npy"
             )
 
     def _truths(
         self, truth: Path, mesh: Path | None, frame_rate: float | None, unit: str | None
     ) -> dict[str, MotionFile]:
-        """The truth's motions by clip; what its corpus knows of faces and sound is kept for bare arrays."""
+        """The truth's motions by clip; its corpus's faces and sounds serve bare arrays, too."""
         corpus_like = truth == Path("puppet") or any((truth / name).is_dir() for name in MOTION_FOLDERS)
         if not corpus_like and any(truth.glob("*.npz")):
             animations = find_animations(truth)
@@ -199,28 +198,25 @@ class StudyAnimations:
         }
 
     def subject(self, clip: str) -> str:
-        """Who speaks in a clip: as the corpus says, else what stands before the last underscore of its name."""
+        """The speaker of a clip: as the corpus says, else the part of its name before the last underscore."""
         return self._subjects.get(clip) or clip.rpartition("_")[0] or clip
 
     def facts_for(self, clip: str) -> AnimationFacts:
-        """What a bare array of a clip lacks."""
+        """Mesh, frame rate and unit of a bare array of a clip."""
         return self._templates.get(self.subject(clip), self._facts)
 
     def open(self, name: str) -> StudyClip:
         """Read and check all animations of a clip."""
         motions = {condition: files[name] for condition, files in self._files.items()}
         read = {condition: motion.read() for condition, motion in motions.items()}
-        rates = {condition: animation.frame_rate for condition, animation in read.items()}
-        if len(set(rates.values())) > 1:
-            listed = ", ".join(f"{condition} {rate:g}" for condition, rate in rates.items())
-            raise FaceDiffError(
-                f"{name}: differs in frames a second ({listed}); one video has one rate, so generate all at one"
+        lengths = [len(animation.vertices) for animation in read.values()]
+        rates, frames = {animation.frame_rate for animation in read.values()}, min(lengths)
+        if len(rates) > 1 or max(lengths) > (1 + UNEQUAL) * frames + 1:
+            sizes = ", ".join(
+                f"{condition} {len(animation.vertices)} at {animation.frame_rate:g} a second"
+                for condition, animation in read.items()
             )
-        lengths = {condition: len(animation.vertices) for condition, animation in read.items()}
-        frames = min(lengths.values())
-        if max(lengths.values()) > (1 + UNEQUAL) * frames + 1:
-            listed = ", ".join(f"{condition} {length}" for condition, length in lengths.items())
-            raise FaceDiffError(f"{name}: differs in length ({listed} frames); are these animations of one recording?")
+            raise FaceDiffError(f"{name}: differs in frames ({sizes}); expected one recording at one frame rate")
         sound = self._sounds.get(name)
         if sound is None:
             speaking = [c for c, animation in read.items() if animation.speech is not None]
@@ -243,15 +239,13 @@ class StudyAnimations:
             colours if same_mesh else None,
         )
 
-    def reference(self, clip: str, used: Sequence[str], rng: np.random.Generator) -> str | None:
-        """Another clip of the same speaker, one that the study does not ask about if there is any; None without one."""
-        own = [
-            other for other in sorted(self.references) if self.subject(other) == self.subject(clip) and other != clip
-        ]
-        if not own:
-            own = [other for other in self.references if other == self.subject(clip) and other != clip]
-        unused = [other for other in own if other not in used]
-        return str(rng.choice(unused or own)) if own else None
+    def reference(self, clip: str, trials: Sequence[str], rng: np.random.Generator) -> str | None:
+        """Another clip of the same speaker, outside the trials if there is one; None if the speaker has no other."""
+        speaker, candidates = self.subject(clip), sorted(set(self.references) - {clip})
+        same = [name for name in candidates if self.subject(name) == speaker]
+        same = same or [name for name in candidates if name == speaker]
+        unused = [name for name in same if name not in trials]
+        return str(rng.choice(unused or same)) if same else None
 
     def sound_of(self, clip: str, motion: MotionFile) -> Path | None:
         """The sound of a reference: its recording, or its own file if that is an archive."""
@@ -266,10 +260,7 @@ def _known(facts: Mapping[str, Any]) -> AnimationFacts:
 def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = OWN) -> dict[str, Path]:
     """The animations of a folder by clip, as ``facediff animate`` and ``facediff predict`` name them.
 
-    Args:
-        folder: holds ``<clip>.npz``, ``<clip>.npy`` or ``<clip>_condition_<identity>.npy``.
-        subjects: known speakers.
-        identity: which of several conditions is taken: ``own``, the speaker's own, or an identity's name.
+    Of several conditions of a clip the one of ``identity`` is taken: ``own``, the speaker's, or an identity's name.
     """
     inside = sorted(folder.iterdir()) if folder.is_dir() else []
     files = [file for file in inside if file.suffix in ANIMATIONS and file.is_file() and file.name[0] != "."]
@@ -280,7 +271,7 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
         )
     pattern = NamePattern(DEFAULT_PATTERNS[0], subjects)
     by_clip: dict[str, dict[str | None, Path]] = {}
-    own: dict[str, str] = {}
+    speakers: dict[str, str] = {}
     for file in files:
         read = pattern.match(file.stem)
         clip, condition = (read.clip, read.identity) if read is not None else (file.stem, None)
@@ -289,23 +280,23 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
             raise FaceDiffError(f"{file}: is of the same clip as {conditions[condition]}; keep one of them")
         conditions[condition] = file
         if read is not None and read.identity == read.subject:
-            own[clip] = read.subject
-    chosen = {}
+            speakers[clip] = read.subject
+    animations = {}
     for clip, conditions in by_clip.items():
-        asked_for = own.get(clip) if identity == OWN else identity
-        if asked_for in conditions:
-            chosen[clip] = conditions[asked_for]
+        condition = speakers.get(clip) if identity == OWN else identity
+        if condition in conditions:
+            animations[clip] = conditions[condition]
         elif None in conditions:
-            chosen[clip] = conditions[None]
+            animations[clip] = conditions[None]
         elif identity == OWN and len(conditions) == 1:
-            chosen[clip] = next(iter(conditions.values()))
-    if not chosen:
+            animations[clip] = next(iter(conditions.values()))
+    if not animations:
         stored = sorted({str(name) for conditions in by_clip.values() for name in conditions if name})
         raise FaceDiffError(
             f"{folder}: holds no animation under the condition {identity}, but under {', '.join(stored)}; choose one "
             f"with --identity"
         )
-    return chosen
+    return animations
 
 
 def _recordings(folder: Path) -> dict[str, Path]:
@@ -319,21 +310,20 @@ def _recordings(folder: Path) -> dict[str, Path]:
     return recordings
 
 
-def in_unit_of(first: Animation, other: Animation) -> Animation:
-    """An animation in the unit of length of another one, so that one camera shows both in their sizes."""
-    factor = np.float32(metres_per_unit(other.unit) / metres_per_unit(first.unit))
+def in_unit_of(first: Animation, animation: Animation) -> Animation:
+    """An animation in the unit of length of the first, so that one camera shows both in their sizes."""
+    factor = np.float32(metres_per_unit(animation.unit) / metres_per_unit(first.unit))
     if factor == 1:
-        return other
-    return replace(other, vertices=other.vertices * factor, template=other.template * factor, unit=first.unit)
+        return animation
+    vertices, template = animation.vertices * factor, animation.template * factor
+    return replace(animation, vertices=vertices, template=template, unit=first.unit)
 
 
 def read_sound(path: Path, seconds: float) -> tuple[npt.NDArray[np.float32], int]:
     """Speech (S,), cut or padded with silence to so many seconds, and its sample rate; of a recording or archive."""
     if path.suffix == ".npz":
         animation = read_animation(path)
-        if animation.speech is None:
-            raise FaceDiffError(f"{path}: holds no speech; give a folder of recordings with --speech")
-        speech, rate = animation.speech, animation.sample_rate
+        speech, rate = np.zeros(0) if animation.speech is None else animation.speech, animation.sample_rate
     else:
         speech, rate = read_sound_to_play(path)
     length = round(seconds * rate)

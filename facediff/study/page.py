@@ -16,18 +16,13 @@ PAGE = "index.html"
 
 
 def write_page(folder: Path, study: Study) -> None:
-    """Write ``index.html``, whole or not at all.
-
-    Args:
-        folder: the page's folder, with the videos in ``videos``.
-        study: what is asked.
-    """
+    """Write ``index.html`` into the page's folder, which has the videos in ``videos``."""
     with atomic(folder / PAGE) as temporary:
         temporary.write_text(page_of(study), encoding="utf-8", newline="\n")
 
 
 def page_of(study: Study) -> str:
-    """The page's text. It names no method, and says nothing of what is a control."""
+    """The page's text. It names no method and does not mark controls."""
     style, script = _asset("style.css"), _asset("study.js")
     first = study.languages[0]
     facts = {

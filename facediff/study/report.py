@@ -1,4 +1,4 @@
-"""What the answers to a study say: who is counted, which method is preferred, how certain that is, and who agrees."""
+"""Analysis of a study's answers: excluded raters, preferences with intervals, and agreement."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from facediff.reporting.statistics import (
 from facediff.study.answers import Rater, merge, read_answers
 from facediff.study.definition import DATABASE, LEFT, RIGHT, Study, Trial, read_study
 from facediff.study.design import TRUTH
-from facediff.study.statistics import alpha_interval, bradley_terry, krippendorff_alpha
+from facediff.study.statistics import alpha_interval, bradley_terry, is_connected, krippendorff_alpha
 from facediff.study.store import AnswerStore
 from facediff.utils import ranges
 
@@ -33,7 +33,7 @@ Interval = Literal["wilson", "binomial"]
 
 @dataclass(frozen=True)
 class Checks:
-    """What the controls say of a rater.
+    """A rater's results in the controls.
 
     Attributes:
         rater: the rater's token.
@@ -57,12 +57,12 @@ class Preference:
     """How often a condition was preferred to another one.
 
     Attributes:
-        question: what was asked.
-        first: the condition whose share this is.
-        second: what it was compared with.
+        question: its name.
+        first: the condition with this share.
+        second: the other condition.
         wins: answers that name the first.
         losses: answers that name the second.
-        same: answers that see no difference; half of them count for each.
+        same: answers of no difference; half of them count for each.
         share: of the first, from 0 to 1.
         interval: of single answers, Wilson's or the exact binomial one.
         between_raters: of raters that are drawn again; wider where answers of one rater are alike.
@@ -126,19 +126,19 @@ class Agreement:
 
 @dataclass(frozen=True)
 class StudyReport:
-    """What the answers to a study say.
+    """The results of a study.
 
     Attributes:
         name: of the data set or the study, the title of its column in tables.
-        study: what was asked.
+        study: its definition.
         raters: all raters.
-        checks: what the controls say of each.
+        checks: their results in the controls.
         preferences: by question and pair.
         scores: by question; none where conditions cannot be put on one scale.
         agreement: by question.
         sides: by question, the share of answers ``left`` in controls of the same animation twice, with its interval.
         level: of all intervals.
-        notes: what was set aside, and why.
+        notes: on files that were set aside.
     """
 
     name: str
@@ -155,14 +155,14 @@ class StudyReport:
 
     @property
     def counted(self) -> list[Rater]:
-        """The raters whose answers are counted."""
-        kept = {check.rater for check in self.checks if not check.reasons}
-        return [rater for rater in self.raters if rater.token in kept]
+        """The raters that count."""
+        tokens = {check.rater for check in self.checks if not check.reasons}
+        return [rater for rater in self.raters if rater.token in tokens]
 
     def preference(self, question: str, first: str, second: str) -> Preference | None:
         """The preference of one pair."""
-        wanted = (question, first, second)
-        return next((own for own in self.preferences if (own.question, own.first, own.second) == wanted), None)
+        key = (question, first, second)
+        return next((p for p in self.preferences if (p.question, p.first, p.second) == key), None)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the raters, as plain data; numbers that are not finite become None."""
@@ -197,25 +197,15 @@ def _finite(value: Any) -> Any:  # noqa: ANN401 - plain data
 
 
 def gather_raters(
-    folder: Path, study: Study, files: Sequence[Path] = (), others: Collection[str] = ()
+    folder: Path, study: Study, files: Sequence[Path] = (), ignored: Collection[str] = ()
 ) -> tuple[list[Rater], list[str]]:
-    """All raters of a study, each once: of the server's file, and of files that were downloaded.
-
-    Args:
-        folder: the study's folder.
-        study: what was asked.
-        files: downloaded files, and folders of them.
-        others: ids of other studies, whose files are passed over.
-
-    Returns:
-        the raters, and a note on every file that was set aside.
-    """
+    """All raters of a study, each once, from the server and from downloads; and notes on files that are set aside."""
     stored = AnswerStore(folder / DATABASE, study, read_only=True).raters() if (folder / DATABASE).is_file() else []
     downloaded: list[Rater] = []
     notes: list[str] = []
     for path in answer_files(files):
         try:
-            rater = read_answers(path, study, others)
+            rater = read_answers(path, study, ignored)
         except FaceDiffError as error:
             notes.append(f"set aside: {error}")
             continue
@@ -235,7 +225,7 @@ def answer_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def check_rater(rater: Rater, study: Study) -> Checks:
-    """What the controls say of a rater, and whether the study's rule counts them."""
+    """A rater's results in the controls, and the reasons to exclude them by the study's rule."""
     rule = study.rule
     first: dict[tuple[str, frozenset[str], str], str | None] = {}
     again: dict[tuple[str, frozenset[str], str], str | None] = {}
@@ -245,15 +235,15 @@ def check_rater(rater: Rater, study: Study) -> Checks:
         sides[answer] += 1
         unit = (trial.clip, frozenset((trial.left, trial.right)), question)
         if trial.kind == "still":
-            right.append(trial.chosen(answer) == TRUTH)
+            right.append(trial.preferred(answer) == TRUTH)
         elif trial.kind == "pair":
-            first[unit] = trial.chosen(answer)
+            first[unit] = trial.preferred(answer)
         elif trial.kind == "repeat":
-            again[unit] = trial.chosen(answer)
+            again[unit] = trial.preferred(answer)
     share_right = _share(right)
-    share_consistent = _share([first[unit] == chosen for unit, chosen in again.items() if unit in first])
-    named = sides[LEFT] + sides[RIGHT]
-    one_side = max(sides[LEFT], sides[RIGHT]) / named if named else None
+    share_consistent = _share([first[unit] == condition for unit, condition in again.items() if unit in first])
+    choices = sides[LEFT] + sides[RIGHT]
+    one_side = max(sides[LEFT], sides[RIGHT]) / choices if choices else None
     reasons = ["has not finished"] if rule.finished and rater.finished is None else []
     if share_right is not None and share_right < rule.least_right:
         reasons.append(f"named the truth in {share_right:.0%} of the controls, less than {rule.least_right:.0%}")
@@ -287,7 +277,7 @@ class Answers:
     Attributes:
         wins: (R, K, K): how often rater r preferred condition i to j.
         ties: (R, K, K): how often rater r saw no difference between i and j, where i is before j.
-        judged: what each clip with a pair, whichever side its faces are on, was judged as; by two raters at least.
+        judged: the judgements of each clip with a pair, on either side, by at least two raters.
         left: answers to the same animation on both sides that name the left.
         same: all answers to these that name a side.
     """
@@ -301,25 +291,25 @@ class Answers:
 
 def answers_to(question: str, study: Study, raters: Sequence[Rater]) -> Answers:
     """Count the answers to a question; controls and repeated pairs are no part of preferences."""
-    place = {condition: i for i, condition in enumerate(study.conditions)}
-    shape = (len(raters), len(place), len(place))
+    index = {condition: i for i, condition in enumerate(study.conditions)}
+    shape = (len(raters), len(index), len(index))
     wins, ties = np.zeros(shape), np.zeros(shape)
     units: dict[tuple[str, int, int], list[str]] = {}
     sides: Counter[str] = Counter()
     for row, rater in enumerate(raters):
-        for trial, asked, answer in answers_of(rater, study.by_id):
-            if asked != question:
+        for trial, name, answer in answers_of(rater, study.by_id):
+            if name != question:
                 continue
             if trial.kind == "same":
                 sides[answer] += 1
             if trial.kind == "pair":
-                chosen = trial.chosen(answer)
-                i, j = sorted((place[trial.left], place[trial.right]))
-                if chosen is None:
+                winner = trial.preferred(answer)
+                i, j = sorted((index[trial.left], index[trial.right]))
+                if winner is None:
                     ties[row, i, j] += 1
                 else:
-                    wins[row, place[chosen], i + j - place[chosen]] += 1
-                judgement = "same" if chosen is None else "first" if place[chosen] == i else "second"
+                    wins[row, index[winner], i + j - index[winner]] += 1
+                judgement = "same" if winner is None else "first" if index[winner] == i else "second"
                 units.setdefault((trial.clip, i, j), []).append(judgement)
     judged = [unit for unit in units.values() if len(unit) > 1]
     return Answers(wins, ties, judged, sides[LEFT], sides[LEFT] + sides[RIGHT])
@@ -340,18 +330,18 @@ def analyse(
     """Analyse the answers to a study.
 
     Args:
-        study: what was asked.
-        raters: who answered.
+        study: its definition.
+        raters: all raters.
         name: of the data set, for tables.
         level: of all intervals.
         interval: of shares of single answers.
         resamples: for intervals between raters and of alpha.
         seed: of the resamples.
-        notes: on what was set aside before.
+        notes: on files that were set aside.
     """
     checks = tuple(check_rater(rater, study) for rater in raters)
-    counted = [rater for rater, check in zip(raters, checks, strict=True) if not check.reasons]
-    answers = {question.name: answers_to(question.name, study, counted) for question in study.choices}
+    included = [rater for rater, check in zip(raters, checks, strict=True) if not check.reasons]
+    answers = {question.name: answers_to(question.name, study, included) for question in study.choices}
     conditions, options = study.conditions, {"resamples": resamples, "seed": seed}
     return StudyReport(
         name,
@@ -360,25 +350,25 @@ def analyse(
         checks,
         tuple(
             preference
-            for question, given in answers.items()
-            for preference in _preferences(question, conditions, given, level, interval, **options)
+            for question, counts in answers.items()
+            for preference in _preferences(question, conditions, counts, level, interval, **options)
         ),
         tuple(
-            scores for question, given in answers.items() for scores in _strengths(question, conditions, given, level)
+            scores for question, counts in answers.items() for scores in _strengths(question, conditions, counts, level)
         ),
         tuple(
             Agreement(
                 question,
-                krippendorff_alpha(given.judged),
-                alpha_interval(given.judged, level, **options),
-                len(given.judged),
+                krippendorff_alpha(counts.judged),
+                alpha_interval(counts.judged, level, **options),
+                len(counts.judged),
             )
-            for question, given in answers.items()
+            for question, counts in answers.items()
         ),
         {
-            question: (given.left / given.same, wilson_interval(given.left, given.same, level), given.same)
-            for question, given in answers.items()
-            if given.same
+            question: (counts.left / counts.same, wilson_interval(counts.left, counts.same, level), counts.same)
+            for question, counts in answers.items()
+            if counts.same
         },
         level,
         interval,
@@ -386,12 +376,12 @@ def analyse(
     )
 
 
-def _strengths(question: str, conditions: Sequence[str], given: Answers, level: float) -> Iterator[StrengthScores]:
-    """Bradley-Terry scores; none where nobody has answered, or some conditions were never compared with others."""
-    try:
-        strengths = bradley_terry(given.wins + (given.ties + given.ties.transpose(0, 2, 1)) / 2)
-    except FaceDiffError:
+def _strengths(question: str, conditions: Sequence[str], counts: Answers, level: float) -> Iterator[StrengthScores]:
+    """Bradley-Terry scores; none without answers, or where conditions were never compared with the others."""
+    wins = counts.wins + (counts.ties + counts.ties.transpose(0, 2, 1)) / 2
+    if not is_connected(wins):
         return
+    strengths = bradley_terry(wins)
     ends = strengths.intervals(level).tolist()
     scores = dict(zip(conditions, strengths.scores.tolist(), strict=True))
     intervals = {condition: (low, high) for condition, (low, high) in zip(conditions, ends, strict=True)}
@@ -401,7 +391,7 @@ def _strengths(question: str, conditions: Sequence[str], given: Answers, level: 
 def _preferences(
     question: str,
     conditions: Sequence[str],
-    given: Answers,
+    counts: Answers,
     level: float,
     interval: Interval,
     **options: int,
@@ -410,9 +400,9 @@ def _preferences(
     of_answers = wilson_interval if interval == "wilson" else binomial_interval
     preferences = []
     for i, j in combinations(range(len(conditions)), 2):
-        won, lost, same = given.wins[:, i, j], given.wins[:, j, i], given.ties[:, i, j]
-        answers, better = won + lost + same, won + same / 2
-        count, wins, losses = int(answers.sum()), int(won.sum()), int(lost.sum())
+        won, beaten, same = counts.wins[:, i, j], counts.wins[:, j, i], counts.ties[:, i, j]
+        answers, better = won + beaten + same, won + same / 2
+        count, wins, losses = int(answers.sum()), int(won.sum()), int(beaten.sum())
         if count:
             share = float(better.sum()) / count
             ends = of_answers(float(better.sum()), count, level)
@@ -431,20 +421,20 @@ def analyse_folder(
     files: Sequence[Path] = (),
     *,
     name: str | None = None,
-    others: Collection[str] = (),
+    ignored: Collection[str] = (),
     **options: Any,  # noqa: ANN401 - passed on
 ) -> StudyReport:
-    """Analyse the study of a folder: what its server has stored, and files that raters have downloaded.
+    """Analyse the study of a folder: answers of its server, and files that raters have downloaded.
 
     Args:
         folder: the study's folder.
         files: downloaded files, and folders of them.
         name: of the data set, for tables; the folder's name if None.
-        others: ids of other studies, whose files are passed over.
-        options: as :func:`analyse` takes them.
+        ignored: ids of other studies, the files of which are passed over.
+        options: of :func:`analyse`.
     """
     study = read_study(folder)
-    raters, notes = gather_raters(folder, study, files, others)
+    raters, notes = gather_raters(folder, study, files, ignored)
     if not any(rater.answers for rater in raters):
         more = f" ({notes[0]})" if notes else ""
         raise FaceDiffError(

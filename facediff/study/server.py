@@ -1,18 +1,17 @@
 """A small server of a study: the page and its videos, and answers into an SQLite file. Nothing else leaves or enters.
 
-Raters are nobody's friends until proven otherwise: bodies are bounded before they are read, everything in them is
-checked by :mod:`facediff.study.answers`, and only the videos that the study names are served.
+Requests are not trusted: their size is bounded before they are read, their content is checked by
+:mod:`facediff.study.answers`, and only the study's videos are served.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError
 from facediff.study.answers import (
     MOST_RATERS,
     Answer,
@@ -54,15 +53,7 @@ def make_app(
     hosts: tuple[str, ...] | None = LOOPBACK,
     public_name: str | None = None,
 ) -> Starlette:
-    """The ASGI application.
-
-    Args:
-        folder: the study's folder.
-        study: what it asks.
-        store: where answers go.
-        hosts: names under which the page is served; None for any.
-        public_name: name under which a web server in front offers it.
-    """
+    """The ASGI application."""
     from starlette.applications import Starlette
     from starlette.concurrency import run_in_threadpool
     from starlette.responses import FileResponse, JSONResponse
@@ -95,9 +86,9 @@ def make_app(
         return number
 
     def answer(content: dict[str, Any]) -> dict[str, Any]:
-        given = read_record(Answer, content, "request", strict=False)
-        check_answer(given, study, number_of(content.get("rater")), "request")
-        return {"new": store.save(content["rater"], given)}
+        record = read_record(Answer, content, "request", strict=False)
+        check_answer(record, study, number_of(content.get("rater")), "request")
+        return {"new": store.save(content["rater"], record)}
 
     def finish(content: dict[str, Any]) -> dict[str, Any]:
         end = read_record(RatingsEnd, content, "request", strict=False)
@@ -144,18 +135,16 @@ def serve(
     most_raters: int | None = None,
     ready: Callable[[str], object] | None = None,
 ) -> AnswerStore:
-    """Serve a study until Ctrl-C; where its answers are.
+    """Serve a study until Ctrl-C; the store of its answers.
 
     Args:
         folder: the study's folder; answers go into ``answers.sqlite`` there.
-        host: address to listen at; by default nobody but this machine reaches it.
+        host: address to listen at; by default only this machine reaches it.
         port: to listen at; 0 for any free one.
-        name: of the host as which a web server in front offers the page; requests under any other are refused.
+        name: host name of a web server in front; requests under other names are refused.
         most_raters: raters that the study takes; no limit if None.
         ready: called with the page's address as soon as it can be opened.
     """
-    if name is not None and not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?", name):
-        raise OptionError("name", "is no name of a host; expected one such as study.lab.example", name)
     require_server("serving a study")
     study = check_folder(folder)
     store = AnswerStore(folder / DATABASE, study, most_raters=most_raters or MOST_RATERS)

@@ -1,6 +1,6 @@
 """Bradley-Terry scores, agreement between raters, and how many raters a study needs.
 
-Each follows one formula of the literature, named in its docstring; none knows anything of studies.
+Each follows one formula of the literature, named in its docstring.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
 from facediff.reporting.statistics import Array
 from facediff.utils import ranges
 
@@ -54,17 +53,16 @@ def bradley_terry(wins: Array) -> BradleyTerry:
     of fewer, the inverse of the information.
 
     Args:
-        wins: (R, K, K): how often rater r preferred i to j; half for no difference.
+        wins: (R, K, K): how often rater r preferred i to j; half for no difference. All conditions are connected by
+            comparisons (:func:`is_connected`), or their scores have no common scale.
 
     Example:
-        >>> found = bradley_terry(np.array([[[0.0, 3.0], [1.0, 0.0]]]))
-        >>> bool(np.isclose(found.scores[0] - found.scores[1], np.log(3)))
+        >>> result = bradley_terry(np.array([[[0.0, 3.0], [1.0, 0.0]]]))
+        >>> bool(np.isclose(result.scores[0] - result.scores[1], np.log(3)))
         True
     """
     conditions = wins.shape[1]
     total = wins.sum(0)
-    if _components(total + total.T) > 1:
-        raise FaceDiffError("some conditions were never compared with the others; their scores have no common scale")
     bounded = _components(total, strong=True) == 1
     played = wins + wins.transpose(0, 2, 1)
     if not bounded:
@@ -91,6 +89,12 @@ def bradley_terry(wins: Array) -> BradleyTerry:
     return BradleyTerry(scores, inverse, bounded, robust)
 
 
+def is_connected(wins: Array) -> bool:
+    """Whether comparisons (R, K, K) connect all conditions, so that their scores have a common scale."""
+    total = wins.sum(0)
+    return _components(total + total.T) == 1
+
+
 def _components(links: Array, *, strong: bool = False) -> int:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
@@ -103,7 +107,7 @@ def krippendorff_alpha(units: Sequence[Sequence[str]]) -> float:
     """Krippendorff's (2011) alpha for nominal data: agreement beyond chance, 1 if all agree and 0 if chance rules.
 
     Args:
-        units: for everything that was judged, the judgements; those with fewer than two count for nothing.
+        units: the judgements of each unit; units with fewer than two do not count.
 
     Returns:
         alpha; NaN if no two judgements can be compared, or all are alike everywhere.
@@ -158,7 +162,7 @@ def _powers(counts: npt.NDArray[np.int64], share: float, level: float) -> Array:
 
 @dataclass(frozen=True)
 class PowerPlan:
-    """How many raters a study needs.
+    """The number of raters that a study needs.
 
     Attributes:
         raters: that are needed.
@@ -183,7 +187,7 @@ def raters_needed(
     correlation: ranges.Correlation = 0.1,
     comparisons: ranges.PerRater = 1,
 ) -> PowerPlan:
-    """How many raters a difference of preference takes to be noticed.
+    """The number of raters that detect a difference of preference.
 
     Answers are counted by the exact two-sided binomial test against one half, at the level of Bonferroni where there
     are several comparisons; the number is the smallest from which on the power is never less. Answers of one rater are
@@ -206,8 +210,8 @@ def raters_needed(
     from scipy.stats import norm
 
     z = norm.ppf((1 + corrected) / 2) + norm.ppf(power)
-    most = math.ceil(2 * (0.5 * z / difference) ** 2) + 60
-    counts = np.arange(1, most + 1)
+    limit = math.ceil(2 * (0.5 * z / difference) ** 2) + 60
+    counts = np.arange(1, limit + 1)
     powers = _powers(counts, share, corrected)
     # The power goes up and down by turns, since wins are whole numbers.
     answers = int(counts[np.flatnonzero(powers < power).max() + 1])

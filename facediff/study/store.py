@@ -80,21 +80,12 @@ class AnswerStore:
 
     @contextmanager
     def _write(self) -> Iterator[sqlite3.Connection]:
-        with self._open() as database:
-            database.execute("BEGIN IMMEDIATE")  # a lock from the first statement on: nobody else writes in between
-            try:
-                yield database
-            except BaseException:
-                database.execute("ROLLBACK")
-                raise
-            database.execute("COMMIT")
+        with self._open() as database, database:  # commits, or rolls back after an error
+            database.execute("BEGIN IMMEDIATE")  # a lock from the first statement on
+            yield database
 
     def register(self, token: str, language: str, code: str) -> int:
-        """The number of a rater, the next free one for a new rater.
-
-        Raises:
-            FullError: if there are as many raters as the study takes.
-        """
+        """The number of a rater, the next free one for a new rater; FullError if the study takes no more."""
         with self._write() as database:
             row = database.execute("SELECT number FROM raters WHERE token = ?", (token,)).fetchone()
             if row is not None:
@@ -114,11 +105,11 @@ class AnswerStore:
     def save(self, token: str, answer: Answer) -> bool:
         """Store a known rater's answers to a trial; False if there were some already, which stay."""
         with self._write() as database:
-            done = database.execute(
+            cursor = database.execute(
                 "INSERT INTO answers VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
                 (token, answer.trial, json.dumps(dict(answer.answers)), answer.seconds, answer.plays, answer.at),
             )
-            return done.rowcount > 0
+            return cursor.rowcount > 0
 
     def finish(self, token: str, comments: Mapping[str, str]) -> bool:
         """Store a rater's comments, and that the rater has finished; False if answers are missing.
@@ -149,19 +140,14 @@ class AnswerStore:
             comments: dict[str, dict[str, str]] = {}
             for rater, question, text in database.execute("SELECT rater, question, text FROM comments"):
                 comments.setdefault(rater, {})[question] = text
-            rows = list(
+            rows: list[tuple[str, int, str, str, str, str | None]] = list(
                 database.execute("SELECT token, number, language, code, started, finished FROM raters ORDER BY number")
             )
-        return [_rater(row, answers.get(row[0], {}), comments.get(row[0], {})) for row in rows]
-
-
-def _rater(row: tuple[str, int, str, str, str, str | None], answers: dict[str, Answer], texts: dict[str, str]) -> Rater:
-    token, number, language, code, started, finished = row
-    return Rater(token, number, language, code, started, finished, answers, texts)
+        return [Rater(*row, answers.get(row[0], {}), comments.get(row[0], {})) for row in rows]
 
 
 def study_of(path: Path) -> str | None:
-    """The id of the study whose answers a file holds; None if it holds none."""
+    """The id of the study of a file of answers; None if it holds none."""
     with _opened(path, read_only=True) as database:
         row = database.execute("SELECT id FROM study").fetchone()
         return None if row is None else str(row[0])
@@ -178,7 +164,7 @@ def _opened(path: Path, *, read_only: bool) -> Iterator[sqlite3.Connection]:
     """A connection; SQLite's errors become a sentence that names the file."""
     name: str = str(path)
     if read_only:
-        # Reading needs a file of locks next to the database, unless nobody can be writing.
+        # Reading needs a file of locks next to the database, unless it cannot be written.
         still = not os.access(path.parent, os.W_OK) and not path.with_name(f"{path.name}-wal").exists()
         name = f"file:{quote(str(path.absolute()))}?mode=ro{'&immutable=1' if still else ''}"
     try:

@@ -50,7 +50,7 @@ def write_report(reports: Sequence[StudyReport], folder: Path) -> list[Path]:
         folder,
         {
             "report.md": markdown(blocks(reports)),
-            "report.html": html_page("User study", blocks(reports, drawn=True)),
+            "report.html": html_page("User study", blocks(reports, with_plots=True)),
             "table.tex": latex(main_table(reports, question) for question in questions(reports)),
             "report.json": json_text("report.json", {"studies": [report.as_dict() for report in reports]}) + "\n",
             "answers.json": json_text("answers.json", {"answers": answers, "comments": texts}) + "\n",
@@ -90,8 +90,8 @@ def main_table(reports: Sequence[StudyReport], question: str) -> ReportTable:
     )
     rows: Cells = []
     for first, second in pairs:
-        preferences = [report.preference(question, first, second) for report in reports]
-        rows.append([f"{first} and {second}", *(None if own is None else share_of(own) for own in preferences)])
+        shares = (report.preference(question, first, second) for report in reports)
+        rows.append([f"{first} and {second}", *(None if share is None else share_of(share) for share in shares)])
     counts = "; ".join(f"{report.name}: {len(report.counted)} raters" for report in reports)
     kind = {"wilson": "Wilson", "binomial": "exact binomial"}[reports[0].interval]
     return ReportTable(
@@ -108,38 +108,40 @@ def share_of(preference: Preference) -> str:
 
 
 def pair_table(report: StudyReport, question: str) -> ReportTable:
-    """Every pair of a study with everything that is known of it."""
+    """Every pair of a study with all its numbers."""
     head = ["pair", "answers", "first %", report.interval, "between raters", "p", "p corrected"]
     ties = any(preference.same for preference in report.preferences)
     rows: Cells = []
-    for own in report.preferences:
-        if own.question == question:
-            row: list[str | None] = [f"{own.first} and {own.second}", str(own.answers), percent(own.share)]
-            row += [between(*own.interval, percent), between(*own.between_raters, percent)]
-            rows.append([*row, p_value(own.p), p_value(own.p_corrected), *([str(own.same)] if ties else [])])
+    for pair in report.preferences:
+        if pair.question == question:
+            row: list[str | None] = [f"{pair.first} and {pair.second}", str(pair.answers), percent(pair.share)]
+            row += [between(*pair.interval, percent), between(*pair.between_raters, percent)]
+            rows.append([*row, p_value(pair.p), p_value(pair.p_corrected), *([str(pair.same)] if ties else [])])
     return ReportTable([*head, "no difference"] if ties else head, rows)
 
 
 def score_tables(report: StudyReport, question: str) -> list[ReportTable]:
     """Bradley-Terry scores, the highest first; no table where there are none."""
     tables = []
-    for own in report.scores:
-        if own.question == question:
-            ordered = sorted(own.scores.items(), key=lambda item: -item[1])
-            rows = [[name, f"{score:+.3f}", between(*own.intervals[name], "{:+.3f}".format)] for name, score in ordered]
+    for scores in report.scores:
+        if scores.question == question:
+            ordered = sorted(scores.scores.items(), key=lambda item: -item[1])
+            rows = [
+                [name, f"{score:+.3f}", between(*scores.intervals[name], "{:+.3f}".format)] for name, score in ordered
+            ]
             tables.append(ReportTable(["Bradley-Terry", "score", "interval"], rows))
     return tables
 
 
 def rater_table(report: StudyReport) -> ReportTable:
-    """Why raters are not counted, and how many."""
+    """Numbers of raters, and of exclusions by reason."""
     reasons = Counter(reason.split(" in ")[0] for check in report.checks for reason in check.reasons)
     rows: Cells = [["all", str(len(report.raters))], ["counted", str(len(report.counted))]]
     return ReportTable(["raters", "number"], rows + [[reason, str(count)] for reason, count in sorted(reasons.items())])
 
 
 def facts(report: StudyReport) -> list[str]:
-    """What the numbers are, in sentences."""
+    """Definitions of the numbers, in sentences."""
     rule, level = report.study.rule, f"{100 * report.level:g} %"
     kind = "Wilson's score" if report.interval == "wilson" else "the exact binomial (Clopper-Pearson)"
     lines = [
@@ -148,8 +150,8 @@ def facts(report: StudyReport) -> list[str]:
         f"not the still face, at least {rule.least_consistent:.0%} of repeated pairs are answered alike, at most "
         f"{rule.most_on_one_side:.0%} of all answers name one side"
         + (", and everything is answered." if rule.finished else "."),
-        f"Intervals are {level} ones. Those of shares are {kind} intervals of single answers. Those "
-        "between raters come from drawing raters again; quote them where raters answer to a comparison more than once.",
+        f"Intervals are {level} ones: of shares, {kind} intervals of single answers; between raters, from drawing "
+        "raters again. Quote the latter where raters answer to a comparison more than once.",
         "p is of the exact binomial test against one half, corrected by Holm for the comparisons of a question.",
     ]
     for scores in report.scores:
@@ -162,25 +164,25 @@ def facts(report: StudyReport) -> list[str]:
             )
     for agreement in report.agreement:
         alpha = "is not known" if not math.isfinite(agreement.alpha) else f"is {agreement.alpha:.3f}"
-        shown = between(*agreement.interval, "{:.3f}".format)
-        lines.append(f"{agreement.question}: Krippendorff's alpha {alpha} {shown}, over {agreement.units} videos.")
-    for question, (share, ends, count) in report.sides.items():
+        ends = between(*agreement.interval, "{:.3f}".format)
+        lines.append(f"{agreement.question}: Krippendorff's alpha {alpha} {ends}, over {agreement.units} videos.")
+    for question, (share, limits, count) in report.sides.items():
         lines.append(
             f"{question}: of {count} answers to the same animation on both sides, {percent(share, 1)} % name the left "
-            f"{between(*ends, lambda value: percent(value, 1))}."
+            f"{between(*limits, lambda value: percent(value, 1))}."
         )
     if report.study.remark:
         lines.append(f"Shown were animations of {report.study.remark}.")
     return [*lines, *report.notes]
 
 
-def blocks(reports: Sequence[StudyReport], *, drawn: bool = False) -> list[Block]:
+def blocks(reports: Sequence[StudyReport], *, with_plots: bool = False) -> list[Block]:
     """The whole report, with its plots if they are to be drawn."""
     document: list[Block] = [Title("User study")]
     for question in questions(reports):
         document += [Title(question, 2), main_table(reports, question)]
         for report in reports:
-            document += [Title(f"{question}: {report.name}", 3), *(plots(report, question) if drawn else [])]
+            document += [Title(f"{question}: {report.name}", 3), *(plots(report, question) if with_plots else [])]
             document += [pair_table(report, question)]
             document += score_tables(report, question)
     for report in reports:
@@ -190,8 +192,8 @@ def blocks(reports: Sequence[StudyReport], *, drawn: bool = False) -> list[Block
 
 def text(report: StudyReport) -> str:
     """The report for the terminal."""
-    counted = f"{report.name}: {len(report.counted)} of {len(report.raters)} raters are counted"
-    document: list[Block] = [Paragraph(counted)]
+    title = f"{report.name}: {len(report.counted)} of {len(report.raters)} raters are counted"
+    document: list[Block] = [Paragraph(title)]
     for question in questions([report]):
         document += [Title(question, 2), pair_table(report, question), *score_tables(report, question)]
     return terminal_text([*document, rater_table(report), Bullets(facts(report))])
@@ -203,9 +205,9 @@ def plots(report: StudyReport, question: str) -> list[Drawing]:
     label = printable(f"Share of the first of each pair, with its interval: {question}, {report.name}")
 
     def draw(axes: Axes) -> None:
-        for place, row in enumerate(rows):
-            axes.plot(row.interval, [place, place], color="#0b7285", linewidth=2)
-            axes.plot(row.share, place, "o", color="#0b7285", markersize=5)
+        for y, row in enumerate(rows):
+            axes.plot(row.interval, [y, y], color="#0b7285", linewidth=2)
+            axes.plot(row.share, y, "o", color="#0b7285", markersize=5)
         axes.axvline(0.5, color=GREY, linewidth=0.8, zorder=0)
         axes.set_xlim(0, 1)
         axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0 %", "25 %", "50 %", "75 %", "100 %"])
@@ -255,7 +257,7 @@ def answer_rows(reports: Sequence[StudyReport]) -> list[dict[str, Any]]:
 
 
 def _answers(report: StudyReport) -> Iterator[dict[str, Any]]:
-    counted = {rater.token for rater in report.counted}
+    included = {rater.token for rater in report.counted}
     for rater in report.raters:
         for trial, question, answer in answers_of(rater, report.study.by_id):
             stored = rater.answers[trial.id]
@@ -265,7 +267,7 @@ def _answers(report: StudyReport) -> Iterator[dict[str, Any]]:
                 "number": rater.number,
                 "code": rater.code,
                 "language": rater.language,
-                "counted": rater.token in counted,
+                "counted": rater.token in included,
                 "trial": trial.id,
                 "kind": trial.kind,
                 "clip": trial.clip,
@@ -273,7 +275,7 @@ def _answers(report: StudyReport) -> Iterator[dict[str, Any]]:
                 "right": trial.right,
                 "question": question,
                 "answer": answer,
-                "chosen": trial.chosen(answer) or "",
+                "chosen": trial.preferred(answer) or "",
                 "seconds": stored.seconds,
                 "plays": stored.plays,
                 "at": stored.at,

@@ -23,7 +23,7 @@ BUNDLED = {
     "comments": Question("comments", {}, kind="text"),
 }
 """Questions whose texts are bundled, under ``questions`` in ``assets/texts/*.json``."""
-REMEDY = "see docs/user_study.md for what a file of questions holds"
+REMEDY = "docs/user_study.md describes files of questions"
 
 
 @cache
@@ -89,11 +89,11 @@ class Questionnaire:
         languages: of the page.
 
     Attributes:
-        questions: what is asked, in order.
-        title: shown above everything.
-        consent: what raters agree to.
-        rule: whose answers are not counted.
-        chosen: whether the file names the questions, so that none may be left out for lack of references.
+        questions: in order.
+        title: of the page.
+        consent: of the raters.
+        rule: of exclusion.
+        named: whether the file names the questions, so that none may be left out for lack of references.
     """
 
     def __init__(self, path: Path | None, languages: Sequence[str]) -> None:
@@ -104,44 +104,44 @@ class Questionnaire:
         self.title = self._texts(content.title, "title", standard("title", languages))
         self.consent = self._texts(content.consent, "consent", standard("consent", languages))
         self.rule = content.rule
-        self.chosen = content.questions is not None
+        self.named = content.questions is not None
         entries = (*PAPER_QUESTIONS, "comments") if content.questions is None else content.questions
         self.questions = [self._question(entry, f"questions[{i}]") for i, entry in enumerate(entries)]
         names = [question.name for question in self.questions]
         if len({*names}) < len(names) or not any(question.kind == "choice" for question in self.questions):
             raise FaceDiffError(f"{path}: questions are {', '.join(names)}; expected each once, and a choice; {REMEDY}")
 
-    def _question(self, content: object, place: str) -> Question:
+    def _question(self, content: object, key: str) -> Question:
         content = {"name": content} if isinstance(content, str) else content
-        entry = read_record(QuestionEntry, content, self.source, remedy=REMEDY, name=place)
-        if entry.text is None and entry.name not in BUNDLED:
-            advice = f'there is no bundled question "{entry.name}": {choices(entry.name, BUNDLED)}'
-            raise FaceDiffError(f"{self.source}: {place} has no text, and {advice}")
-        usual = bundled_question(entry.name, self.languages) if entry.name in BUNDLED else Question(entry.name, {})
+        entry = read_record(QuestionEntry, content, self.source, remedy=REMEDY, name=key)
+        bundled = bundled_question(entry.name, self.languages) if entry.name in BUNDLED else Question(entry.name, {})
         return Question(
             entry.name,
-            self._texts(entry.text, f"{place}.text", usual.text),
-            entry.kind or usual.kind,
-            usual.reference if entry.reference is None else entry.reference,
-            usual.no_difference if entry.no_difference is None else entry.no_difference,
+            self._texts(entry.text, f"{key}.text", bundled.text),
+            entry.kind or bundled.kind,
+            bundled.reference if entry.reference is None else entry.reference,
+            bundled.no_difference if entry.no_difference is None else entry.no_difference,
         )
 
-    def _texts(self, content: Any, place: str, default: Texts) -> Texts:  # noqa: ANN401 - a text or a mapping
+    def _texts(self, content: Any, key: str, default: Texts) -> Texts:  # noqa: ANN401 - a text or a mapping
         """A text for every language: one for all, or one by language."""
         texts = dict.fromkeys(self.languages, content) if isinstance(content, str) else content or default
-        wanted: dict[str, Any] = {name: texts.get(name) if isinstance(texts, dict) else None for name in self.languages}
-        for language, text in wanted.items():
+        complete: dict[str, Any] = {
+            name: texts.get(name) if isinstance(texts, dict) else None for name in self.languages
+        }
+        for language, text in complete.items():
             if not isinstance(text, str) or not text.strip():
                 raise FaceDiffError(
-                    f"{self.source}: {place} has no text in {language}; add one, or choose --languages without it"
+                    f"{self.source}: {key} has no text in {language}; add one, choose --languages without it, or name "
+                    f"one of the bundled questions: {', '.join(BUNDLED)}"
                 )
-        return wanted
+        return complete
 
 
 def page_texts(languages: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
     """The words of the page's buttons and hints, by language."""
-    kept = ("title", "consent", "questions")
+    replaced = ("title", "consent", "questions")
     return {
-        language: {name: text for name, text in bundled_texts()[language].items() if name not in kept}
+        language: {name: text for name, text in bundled_texts()[language].items() if name not in replaced}
         for language in languages
     }

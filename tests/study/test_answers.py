@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from facediff.cli.app import main
-from facediff.errors import FaceDiffError
 from facediff.study import analyse_folder, simulate
 from facediff.study.answers import merge
 from tests.fakes.study import SCORES, as_file, small_study, write_answers, write_study
@@ -44,11 +43,3 @@ def test_raters_of_several_sources_are_merged_and_what_was_first_stays() -> None
     (whole,) = merge([[one], [other]])
     assert [whole.answers[name].seconds == 99 for name in names] == [False, False, *[True] * (len(names) - 2)]
     assert whole.finished == rater.finished
-
-
-def test_no_answers_is_one_sentence(tmp_path: Path) -> None:
-    folder = write_study(tmp_path / "study", small_study())
-    with pytest.raises(FaceDiffError, match="--answers"):
-        analyse_folder(folder)
-    with pytest.raises(FaceDiffError, match=r"missing\.json"):
-        analyse_folder(folder, [tmp_path / "missing.json"])

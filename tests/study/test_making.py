@@ -173,25 +173,6 @@ def test_mistakes_are_one_sentence_and_leave_nothing(place: Path, refused: Calla
         assert named in refused(*base, "--questions", "q.yaml")
 
 
-def test_animations_that_do_not_belong_together_are_refused(place: Path, refused: Callable[..., str]) -> None:
-    whole = read_archive(place / "ours" / "A_one.npz")
-    base = ("ours=ours", "theirs=theirs", "-o", "study")
-    for changed, named in (
-        (replace(whole, frame_rate=30.0), "30"),
-        (replace(whole, vertices=whole.vertices[:9]), "length"),
-        (replace(whole, faces=None), "--mesh"),
-    ):
-        write_archive(place / "ours" / "A_one.npz", changed)
-        error = refused(*base)
-        assert "A_one" in error
-        assert named in error
-    for folder in ("ours", "theirs"):
-        write_archive(place / folder / "A_one.npz", replace(whole, speech=None))
-    assert "--speech" in refused(*base)
-    (place / "ours" / "A_one.npz").write_bytes(b"damaged")
-    assert "A_one.npz" in refused(*base)
-
-
 def test_a_study_with_answers_is_not_replaced(place: Path, refused: Callable[..., str]) -> None:
     assert make(*FEW) == 0
     study = read_study(place / "study")

@@ -176,7 +176,7 @@ def test_the_plan_is_printed_without_and_with_a_study(tmp_path: Path, capsys: py
     assert main(["study", "report", "--plan", "0.1"]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("210 raters")
-    assert "each of 1 comparison; those that are not counted" in printed  # nothing of one answer's being correlated
+    assert "each of 1 comparison; excluded raters" in printed  # one answer is not correlated
     folder = write_study(tmp_path / "study", small_study(clips=8))
     assert main(["study", "report", str(folder), "--plan", "0.1", "--correlation", "0"]) == 0
     found = re.match(r"study: (\d+) raters", capsys.readouterr().out)
