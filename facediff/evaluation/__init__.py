@@ -1,4 +1,4 @@
-"""Scoring files of predictions against files of truth, whoever wrote them."""
+"""Scoring files of predictions against files of truth, from any program."""
 
 from facediff.evaluation.evaluator import evaluate
 from facediff.evaluation.files import DEFAULT_PATTERNS, TRUTH_PATTERN, Missing, read_region

@@ -1,4 +1,4 @@
-"""Score several methods' files against the truth, one clip at a time, with what metrics read of the corpus."""
+"""Score several methods' files against the truth, one clip at a time."""
 
 from __future__ import annotations
 
@@ -55,19 +55,19 @@ class EvaluationOptions:
         n_vertices: vertices V of the mesh.
         protocols: names of protocols, or protocols of one's own.
         metrics: further metrics, each the name of a registered one, which may be followed by options:
-            ``temporal_misalignment:at=path,smoothing=1.5``. What they need in addition is found in ``corpus``.
-        lip_pairs: pairs of inner-lip vertices; those of the corpus if None.
-        eyelid_pairs: pairs of eyelid vertices, by which blinks are seen; those of the corpus if None.
+            ``temporal_misalignment:at=path,smoothing=1.5``. Their further inputs come from ``corpus``.
+        lip_pairs: pairs of inner-lip vertices; the corpus's if None.
+        eyelid_pairs: pairs of eyelid vertices, by which blinks are seen; the corpus's if None.
         corpus: corpus folder of the truth, whose ``wav``, ``phonemes``, ``regions/inner_lip_pairs.txt`` and
             ``manifest.json`` are used where a metric needs them.
         by: attributes of clips, columns of the corpus's ``clips.csv``, by which scores are grouped too.
-        frame_rate: frames per second of the predictions; that of the corpus's ``manifest.json`` if None.
-        topology: name of the mesh (``biwi``, ``vocaset`` …), to have unusual regions pointed out.
+        frame_rate: frames per second of the predictions; from the corpus's ``manifest.json`` if None.
+        topology: name of the mesh (``biwi``, ``vocaset`` …), for a remark on unusual regions.
         files: how files of parameters are read; None for files of vertices.
-        unit: unit of lengths of the scores of vertices; that of each protocol, or of the vertices, if None.
+        unit: unit of lengths of the scores of vertices; each protocol's, or the vertices', if None.
         file_unit: unit of the vertices; as the rig or the corpus's ``manifest.json`` says if None.
         renders: render metrics by name with options; see :mod:`facediff.evaluation.renders`.
-        faces: (F, 3) triangles, by which motion is rendered; those of the rig if None.
+        faces: (F, 3) triangles, of the rendered mesh; the rig's if None.
         patterns: how predictions may be named; see :class:`facediff.evaluation.files.NamePattern`.
         truth_pattern: how truths are named.
         identity: which predictions of a clip are scored where several were conditioned on different identities:
@@ -120,22 +120,22 @@ class EvaluationOptions:
         return {name: region.indices for name, region in parts.items() if region is not None}
 
     def completed(self, needed: Set[str], *, rate: bool, methods: Mapping[str, str | Path]) -> EvaluationOptions:
-        """The options with what the corpus says: the frame rate, if it is wanted, and pairs that metrics need."""
-        found: dict[str, Any] = {}
+        """The options with the corpus's frame rate, if one is needed, and its pairs for metrics."""
+        changes: dict[str, Any] = {}
         if self.files is not None:
             files = replace(self.files, predictions=tuple(map(Path, methods.values())))
-            found = {"files": files, "frame_rate": files.frame_rate}
+            changes = {"files": files, "frame_rate": files.frame_rate}
         elif self.frame_rate is None and rate and self.corpus is not None:
             stored = read_manifest(self.corpus).get("frame_rate")
             if isinstance(stored, int | float) and stored > 0:
-                found["frame_rate"] = stored / self.truth_stride
+                changes["frame_rate"] = stored / self.truth_stride
         for field, need, file, kind in (
             ("lip_pairs", "lip_pairs", LIP_PAIRS, LipPairs),
             ("eyelid_pairs", "lid_pairs", EYELID_PAIRS, EyelidPairs),
         ):
             if getattr(self, field) is None and need in needed and self.corpus and (self.corpus / file).is_file():
-                found[field] = read_pairs(None, self.corpus, self.n_vertices, kind)
-        return replace(self, **found)
+                changes[field] = read_pairs(None, self.corpus, self.n_vertices, kind)
+        return replace(self, **changes)
 
 
 def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: Any) -> EvaluationReport:  # noqa: ANN401
@@ -149,74 +149,74 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
         truth: folder of truths.
         options: the fields of :class:`EvaluationOptions`, of which ``lips`` and ``n_vertices`` are needed.
     """
-    given = EvaluationOptions(**options)
-    if not methods or not given.protocols:
-        raise FaceDiffError("expected at least one method and at least one protocol")
-    settings = find_protocols(given.protocols, given.topology)
-    sampling = Bootstrap(given.bootstrap, given.level, given.seed)
-    source = source_unit(settings, given)
-    scales = {setting.name: scale_of(source, given.unit or setting.unit) for setting in settings}
-    requests = {request.text: request.scaled(scale_of(source, given.unit)) for request in parse_all(given.metrics)}
-    further = [
-        (setting.name, label, request)
-        for setting in settings
-        for label, request in setting.further(scales[setting.name]).items()
+    scoring = EvaluationOptions(**options)
+    protocols = find_protocols(scoring.protocols, scoring.topology)
+    sampling = Bootstrap(scoring.bootstrap, scoring.level, scoring.seed)
+    source = source_unit(protocols, scoring)
+    scales = {protocol.name: scale_of(source, scoring.unit or protocol.unit) for protocol in protocols}
+    requests = {request.text: request.scaled(scale_of(source, scoring.unit)) for request in parse_all(scoring.metrics)}
+    of_protocols = [
+        (protocol.name, label, request)
+        for protocol in protocols
+        for label, request in protocol.further(scales[protocol.name]).items()
     ]
-    requests |= {f"{owner}/{label}": request for owner, label, request in further}
+    requests |= {f"{owner}/{label}": request for owner, label, request in of_protocols}
     needed = {need for request in requests.values() for need in request.needs}
-    given = given.completed(needed, rate=bool(requests or given.renders), methods=methods)
-    suffixes = (".npy",) if given.files is None else SUFFIXES
-    names, unnamed_truths = list_names(Path(truth), [NamePattern(given.truth_pattern, given.templates or ())], suffixes)
+    scoring = scoring.completed(needed, rate=bool(requests or scoring.renders), methods=methods)
+    suffixes = (".npy",) if scoring.files is None else SUFFIXES
+    names, unnamed_truths = list_names(
+        Path(truth), [NamePattern(scoring.truth_pattern, scoring.templates or ())], suffixes
+    )
     truths = index_truths(names)
-    if given.files is not None and given.files.rig is None:
-        refuse_vertex_protocols(settings)
-    material = CorpusInputs(given, sorted({name.subject for name in names.values()}))
+    if scoring.files is not None and scoring.files.rig is None:
+        refuse_vertex_protocols(protocols)
+    material = CorpusInputs(scoring, sorted({name.subject for name in names.values()}))
     context = material.context()
     metrics = {name: request.build(context) for name, request in requests.items()}
     scorer = Scorer(
-        settings,
-        lips=given.lips,
-        upper_face=given.upper_face,
-        templates=given.templates or {},
-        n_vertices=given.n_vertices,
-        truth_stride=given.truth_stride,
+        protocols,
+        lips=scoring.lips,
+        upper_face=scoring.upper_face,
+        templates=scoring.templates or {},
+        n_vertices=scoring.n_vertices,
+        truth_stride=scoring.truth_stride,
         metrics=metrics,
         inputs=partial(material.inputs, needed=needed),
         moments={name: request.moment for name, request in requests.items()},
-        owners={f"{owner}/{label}": (owner, label) for owner, label, _ in further},
-        read=None if given.files is None else given.files.read,
-        channels=None if given.files is None else channel_regions(given.files.space),
+        owners={f"{owner}/{label}": (owner, label) for owner, label, _ in of_protocols},
+        read=None if scoring.files is None else scoring.files.read,
+        channels=None if scoring.files is None else channel_regions(scoring.files.space),
         scales=scales,
     )
-    tables = score_methods(methods, Path(truth), truths, scorer, given, suffixes)
+    tables = score_methods(methods, Path(truth), truths, scorer, scoring, suffixes)
     clips = {pair.truth.path.stem for table in tables for pair, _ in table.rows}
-    attributes = attributes_of(given.corpus, clips, given.by) if given.by else {}
-    chosen = {request.text: metrics[request.text] for request in parse_all(given.metrics)}
+    attributes = attributes_of(scoring.corpus, clips, scoring.by) if scoring.by else {}
+    by_name = {request.text: metrics[request.text] for request in parse_all(scoring.metrics)}
     results = [table.result(sampling, attributes) for table in tables]
     return EvaluationReport(
         truth=str(truth),
-        lips=given.lips,
-        upper_face=given.upper_face if needs_upper_face(settings, given.metrics) else None,
-        n_vertices=given.n_vertices,
-        protocols={setting.name: setting.describe() for setting in settings} | definitions(chosen),
-        identity=given.identity,
-        truth_stride=given.truth_stride,
-        resamples=given.bootstrap,
-        level=given.level,
-        seed=given.seed,
+        lips=scoring.lips,
+        upper_face=scoring.upper_face if needs_upper_face(protocols, scoring.metrics) else None,
+        n_vertices=scoring.n_vertices,
+        protocols={protocol.name: protocol.describe() for protocol in protocols} | definitions(by_name),
+        identity=scoring.identity,
+        truth_stride=scoring.truth_stride,
+        resamples=scoring.bootstrap,
+        level=scoring.level,
+        seed=scoring.seed,
         methods=results,
         runs=runs_of(results),
         groups=[group for table in tables for group in table.groups(attributes)],
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,
         remarks=scorer.remarks,
-        renders=score_renders(tables, scorer, given),
-        points="channels" if given.files is not None and given.files.rig is None else "vertices",
+        renders=score_renders(tables, scorer, scoring),
+        points="channels" if scoring.files is not None and scoring.files.rig is None else "vertices",
     )
 
 
 def definitions(metrics: Mapping[str, object]) -> dict[str, str]:
-    """What metrics chosen by name are, as the definition of a protocol of their own."""
+    """The definitions of metrics chosen by name."""
     lines = [f"  {name}: {getattr(metric, 'definition', type(metric).__doc__)}" for name, metric in metrics.items()]
     return {METRICS: "\n".join(["further metrics", *lines])} if lines else {}
 
@@ -226,54 +226,56 @@ def score_methods(
     truth: Path,
     truths: Mapping[str, Truth],
     scorer: Scorer,
-    given: EvaluationOptions,
+    options: EvaluationOptions,
     suffixes: Sequence[str],
 ) -> list[MethodTable]:
     """Pair each method's files with the truths, and score all clips together."""
-    readers = [NamePattern(pattern, given.templates or ()) for pattern in given.patterns]
+    readers = [NamePattern(pattern, options.templates or ()) for pattern in options.patterns]
     paired = {}
     for method, folder in methods.items():
         predictions, unnamed = list_names(Path(folder), readers, suffixes)
-        pairs, missing = pair_up(predictions, truths, given.identity)
-        paired[method] = pairs, replace(missing, unnamed=unnamed)
+        pairs, unscored = pair_up(predictions, truths, options.identity)
+        paired[method] = pairs, replace(unscored, unnamed=unnamed)
     jobs = [(method, pair) for method, (pairs, _) in paired.items() for pair in pairs]
-    reads = [truth, *map(Path, methods.values()), *([] if given.corpus is None else [given.corpus])]
-    scores = score_all(scorer, jobs, given.workers, scheduler=given.scheduler, reads=reads, progress=given.progress)
+    reads = [truth, *map(Path, methods.values()), *([] if options.corpus is None else [options.corpus])]
+    scores = score_all(
+        scorer, jobs, options.workers, scheduler=options.scheduler, reads=reads, progress=options.progress
+    )
     return [
-        MethodTable(method, str(methods[method]), pairs, missing, scores.get(method, {}), scorer.columns)
-        for method, (pairs, missing) in paired.items()
+        MethodTable(method, str(methods[method]), pairs, unscored, scores.get(method, {}), scorer.columns)
+        for method, (pairs, unscored) in paired.items()
     ]
 
 
 def score_renders(
-    tables: Sequence[MethodTable], scorer: Scorer, given: EvaluationOptions
+    tables: Sequence[MethodTable], scorer: Scorer, options: EvaluationOptions
 ) -> dict[str, dict[str, float]]:
-    """Means over clips of the scores on renders, of every method and of the truth; empty if none are asked for."""
-    if not given.renders:
+    """Means over clips of the scores on renders, of every method and of the truth; empty without render metrics."""
+    if not options.renders:
         return {}
-    metrics = read_render_metrics(given.renders)
-    if given.faces is None or given.frame_rate is None:
-        lacking = "triangles (--mesh FILE)" if given.faces is None else "the frame rate (--frame-rate)"
+    metrics = read_render_metrics(options.renders)
+    if options.faces is None or options.frame_rate is None:
+        lacking = "triangles (--mesh FILE)" if options.faces is None else "the frame rate (--frame-rate)"
         raise FaceDiffError(f"--render draws motion, and lacks {lacking}; give it")
 
     def speech(clip: str) -> npt.NDArray[np.float32]:
-        path = None if given.corpus is None else given.corpus / "wav" / f"{clip}.wav"
+        path = None if options.corpus is None else options.corpus / "wav" / f"{clip}.wav"
         return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
 
     drawing = RenderScorer(
-        metrics=metrics, faces=given.faces, regions=given.regions, frame_rate=given.frame_rate, speech=speech
+        metrics=metrics, faces=options.faces, regions=options.regions, frame_rate=options.frame_rate, speech=speech
     )
     rows: dict[str, dict[str, dict[str, float]]] = {}
     for table in tables:
         for pair, _ in table.rows:
             truth = scorer.read(pair.truth.path, scorer.truth_stride)
             vertices = truth.get(channels=False)
-            known = scorer.templates.get(pair.truth.name.subject, truth.template)
-            template = (vertices.double().mean(0) if known is None else known.double()).numpy()
+            neutral = scorer.templates.get(pair.truth.name.subject, truth.template)
+            template = (vertices.double().mean(0) if neutral is None else neutral.double()).numpy()
             clip = pair.truth.path.stem
             files = [scorer.read(path, 1).get(channels=False) for path in pair.predictions.values()]
-            drawn = [drawing.score(clip, motion.double().numpy(), template) for motion in files]
-            rows.setdefault(table.name, {})[clip] = means(drawn)
+            scores = [drawing.score(clip, motion.double().numpy(), template) for motion in files]
+            rows.setdefault(table.name, {})[clip] = means(scores)
             if clip not in rows.setdefault("truth", {}):
                 rows["truth"][clip] = drawing.score(clip, vertices.double().numpy(), template)
     return {method: means([*clips.values()]) for method, clips in rows.items()}
@@ -291,33 +293,33 @@ def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> b
 
 @dataclass(frozen=True)
 class CorpusInputs:
-    """What metrics may read of a corpus in addition to motion."""
+    """Inputs of metrics besides motion, from the corpus."""
 
-    given: EvaluationOptions
+    options: EvaluationOptions
     identities: Sequence[str]  # names of all speakers
 
     def context(self) -> Context:
-        """What there is for metrics, and how to get what is missing."""
-        given = self.given
+        """The inputs that metrics can have, and how to provide the others."""
+        options = self.options
         has: dict[str, dict[str, Any]] = {
-            "lips": {"lips": given.lips},
+            "lips": {"lips": options.lips},
             "identities": {"n_identities": len(self.identities)},
         }
-        rates = {"sample_rate": SAMPLE_RATE, "frames_per_second": given.frame_rate}
-        lids = {"pairs": given.eyelid_pairs, "frames_per_second": given.frame_rate}
+        rates = {"sample_rate": SAMPLE_RATE, "frames_per_second": options.frame_rate}
+        lids = {"pairs": options.eyelid_pairs, "frames_per_second": options.frame_rate}
         needs: list[tuple[str, bool, dict[str, Any]]] = [
-            ("upper_face", given.upper_face is not None, {"upper": given.upper_face}),
-            ("lip_pairs", given.lip_pairs is not None, {"pairs": given.lip_pairs}),
-            ("lid_pairs", given.eyelid_pairs is not None, lids),
-            ("template", bool(given.templates) or given.files is not None, {}),
-            ("closures", given.frame_rate is not None and self._has("phonemes"), {}),
-            ("speech", given.frame_rate is not None and self._has("wav"), rates),
-            ("conditions", given.identity == ALL, {}),
-            ("channels", given.files is not None, {}),
+            ("upper_face", options.upper_face is not None, {"upper": options.upper_face}),
+            ("lip_pairs", options.lip_pairs is not None, {"pairs": options.lip_pairs}),
+            ("lid_pairs", options.eyelid_pairs is not None, lids),
+            ("template", bool(options.templates) or options.files is not None, {}),
+            ("closures", options.frame_rate is not None and self._has("phonemes"), {}),
+            ("speech", options.frame_rate is not None and self._has("wav"), rates),
+            ("conditions", options.identity == ALL, {}),
+            ("channels", options.files is not None, {}),
             *((need, self._has(need), {}) for need in CONVERSATION),
         ]
-        has |= {need: arguments for need, there, arguments in needs if there}
-        rate = "" if given.frame_rate else " and give --frame-rate"
+        has |= {need: arguments for need, is_there, arguments in needs if is_there}
+        rate = "" if options.frame_rate else " and give --frame-rate"
         in_test = "is known to `facediff test --model.metrics=[…]` only"
         are_known = in_test.replace("is", "are", 1)
         return Context(
@@ -338,16 +340,16 @@ class CorpusInputs:
                 "style": f"a model's style encoder {in_test}",
                 "time": f"the time that inference takes {in_test}",
             },
-            {} if given.files is None else channel_regions(given.files.space),
+            {} if options.files is None else channel_regions(options.files.space),
         )
 
     def _has(self, folder: str) -> bool:
-        return self.given.corpus is not None and (self.given.corpus / folder).is_dir()
+        return self.options.corpus is not None and (self.options.corpus / folder).is_dir()
 
     def inputs(self, pair: Pair, needed: Set[str]) -> dict[str, Any]:
-        """What the needs mean for one clip, by the name under which metrics take it."""
+        """The inputs of one clip, by the names of the metrics' arguments."""
         inputs: dict[str, Any] = {}
-        corpus, rate, stride = self.given.corpus, self.given.frame_rate, self.given.truth_stride
+        corpus, rate, stride = self.options.corpus, self.options.frame_rate, self.options.truth_stride
         clip = pair.truth.path.stem
         if "identities" in needed:
             inputs["identities"] = [self.identities.index(pair.truth.name.subject)]
@@ -360,28 +362,28 @@ class CorpusInputs:
             inputs["closures"] = [] if file is None else closures(read_phonemes(file), rate)
         if "speaking" in needed:
             inputs["speaking"] = [torch.from_numpy(conversation_file(corpus, "speaking", clip, stride))]
-        if "partner" in needed and self.given.files is not None:
+        if "partner" in needed and self.options.files is not None:
             path = corpus / "partner" / pair.truth.path.name
-            inputs["partner"] = replace(self.given.files, truth=path.parent, rig=None).read(path, stride).channels
+            inputs["partner"] = replace(self.options.files, truth=path.parent, rig=None).read(path, stride).channels
         return inputs
 
 
-def source_unit(protocols: Sequence[Protocol], given: EvaluationOptions) -> str | None:
-    """The unit of the vertices that are scored; None where no score needs it."""
-    named = next((one.name for one in protocols if one.unit is not None), None)
-    if given.unit is None and named is None:
+def source_unit(protocols: Sequence[Protocol], options: EvaluationOptions) -> str | None:
+    """The unit of the scored vertices; None where no score needs it."""
+    with_unit = next((protocol.name for protocol in protocols if protocol.unit is not None), None)
+    if options.unit is None and with_unit is None:
         return None
-    source = given.file_unit or (given.files.unit if given.files is not None else None)
-    if not source and given.corpus is not None:
-        source = str(read_manifest(given.corpus).get("unit") or "")
-    if not source and (given.files is None or given.files.rig is not None):
-        asked = f"--unit {given.unit}" if given.unit is not None else f"protocol {named}"
-        raise FaceDiffError(f"{asked}: the scores' unit is known, that of the files is not; give --file-unit")
+    source = options.file_unit or (options.files.unit if options.files is not None else None)
+    if not source and options.corpus is not None:
+        source = str(read_manifest(options.corpus).get("unit") or "")
+    if not source and (options.files is None or options.files.rig is not None):
+        reason = f"--unit {options.unit}" if options.unit is not None else f"protocol {with_unit}"
+        raise FaceDiffError(f"{reason}: needs the unit of the files; give --file-unit")
     return source or None
 
 
 def scale_of(source: str | None, target: str | None) -> float:
-    """The factor of lengths from one unit to another; 1 where either is not asked for."""
+    """The factor of lengths from one unit to another; 1 without one of them."""
     return 1.0 if source is None or target is None else metres_per_unit(source) / metres_per_unit(target)
 
 

@@ -24,7 +24,7 @@ def errors_of(subject: str) -> Iterator[None]:
         raise FaceDiffError(f"{subject}: {error}") from error
 
 
-# File names: who speaks, what is said, and whose style the prediction was given.
+# File names: speaker, sentence, and the condition of a prediction.
 
 DEFAULT_PATTERNS = ("{subject}_{sentence}_condition_{identity}", "{subject}_{sentence}")
 """How predictions are named by default; the first is that of the field's released projects."""
@@ -35,11 +35,11 @@ FIELDS = ("subject", "sentence", "identity")
 
 @dataclass(frozen=True)
 class Name:
-    """What a file's name says."""
+    """The fields of a file's name."""
 
     subject: str  # who speaks
     sentence: str  # what is said
-    identity: str | None = None  # whose style the prediction was given; None if the name does not say
+    identity: str | None = None  # the condition of the prediction; None if the name does not say
 
     @property
     def clip(self) -> str:
@@ -76,8 +76,8 @@ class NamePattern:
         self._readings = [
             re.compile(
                 "".join(
-                    f"(?P<{part}>{reading.get(part, '[^/]+')})" if place % 2 else re.escape(part)
-                    for place, part in enumerate(parts)
+                    f"(?P<{part}>{reading.get(part, '[^/]+')})" if index % 2 else re.escape(part)
+                    for index, part in enumerate(parts)
                 )
             )
             for reading in readings
@@ -92,7 +92,7 @@ class NamePattern:
 def list_names(
     folder: Path, patterns: Sequence[NamePattern], suffixes: Sequence[str] = (".npy",)
 ) -> tuple[dict[Path, Name], list[str]]:
-    """The motion files of a folder by what their names say, sorted, and the names that no pattern fits.
+    """The motion files of a folder with the fields of their names, sorted, and the names that no pattern fits.
 
     Files whose names begin with a dot are ignored.
     """
@@ -117,7 +117,7 @@ def list_names(
     return names, unnamed
 
 
-# Pairing: which prediction belongs to which truth, and what has no counterpart.
+# Pairing of predictions and truths.
 
 OWN = "own"  # Scores the prediction that was conditioned on the speaker's own identity
 
@@ -143,7 +143,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Missing:
-    """What of one method was not scored."""
+    """Files and clips of one method that were not scored."""
 
     without_truth: list[str] = field(default_factory=list)  # files of clips that have no truth
     # Clips that have no prediction of the conditions asked for.
@@ -165,57 +165,47 @@ def index_truths(names: Mapping[Path, Name]) -> dict[str, Truth]:
 
 
 def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], identity: str) -> tuple[list[Pair], Missing]:
-    """Find each truth's predictions: what can be scored, sorted by clip, and what not.
+    """Find each truth's predictions: pairs sorted by clip, and the files and clips without a counterpart.
 
     Args:
-        predictions: what the names of a method's files say.
+        predictions: a method's files with the fields of their names.
         truths: truths by clip.
-        identity: ``own``: the prediction conditioned on the speaker's own identity, or else the one whose name has no
-            condition; ``all``: every condition; or a condition's name.
+        identity: ``own``: the prediction conditioned on the speaker's own identity, or else the one without a condition
+            in its name; ``all``: every condition; or a condition's name.
     """
-    pairs, missing = list[Pair](), Missing()
+    pairs, unscored = list[Pair](), Missing()
     by_clip: dict[str, dict[str, Path]] = {}
-    own: dict[str, str] = {}
+    speakers: dict[str, str] = {}
     for path, name in predictions.items():
         if name.clip not in truths:
-            missing.without_truth.append(path.name)
+            unscored.without_truth.append(path.name)
             continue
-        conditions = by_clip.setdefault(name.clip, {})
-        condition = name.identity or ""
-        if condition in conditions:
-            raise FaceDiffError(
-                f"{path}: is the same clip and condition as {conditions[condition]}; keep one, or name files "
-                f"apart with --pattern"
-            )
-        conditions[condition] = path
+        files = by_clip.setdefault(name.clip, {})
+        if (duplicate := files.get(name.identity or "")) is not None:
+            raise FaceDiffError(f"{path}: is the same clip and condition as {duplicate}; keep one, or give --pattern")
+        files[name.identity or ""] = path
         if name.identity is not None and name.identity in (name.subject, truths[name.clip].name.subject):
-            own[name.clip] = name.identity
+            speakers[name.clip] = name.identity
     for clip, truth in sorted(truths.items()):
-        there = by_clip.get(clip, {})
+        paths = by_clip.get(clip, {})
         if identity == ALL:  # "" stands for a name without a condition
-            chosen = sorted(name for name in there if name) or list(there)
+            conditions = sorted(name for name in paths if name) or list(paths)
         else:
-            asked_for = own.get(clip, "") if identity == OWN else identity
-            chosen = [asked_for] if asked_for in there else []
-        missing.unused.extend(sorted(path.name for name, path in there.items() if name not in chosen))
-        if chosen:
-            pairs.append(Pair(clip, truth, {name: there[name] for name in chosen}))
+            condition = speakers.get(clip, "") if identity == OWN else identity
+            conditions = [condition] if condition in paths else []
+        unscored.unused.extend(sorted(path.name for name, path in paths.items() if name not in conditions))
+        if conditions:
+            pairs.append(Pair(clip, truth, {name: paths[name] for name in conditions}))
         else:
-            missing.without_prediction.append(clip)
-    return pairs, missing
+            unscored.without_prediction.append(clip)
+    return pairs, unscored
 
 
-# What belongs to the files that are scored: the corpus folder, the mesh's size, regions and lip pairs.
+# The corpus folder, the mesh's size, regions and lip pairs.
 
 
 def find_truths(folder: Path) -> tuple[Path, Path | None]:
-    """The folder that holds the truth's files, and the corpus folder that it belongs to, if it does.
-
-    Args:
-        folder: a corpus folder, its ``vertices_npy``, or any other folder of files.
-    """
-    if not folder.is_dir():
-        raise FaceDiffError(f"{folder}: no such folder; expected the truth's motion files, or a corpus folder")
+    """The folder of the truth's files, and its corpus folder if it has one."""
     for name in MOTION_FOLDERS:
         if (folder / name).is_dir():
             return folder / name, folder
@@ -256,18 +246,18 @@ def read_region(part: Part, n_vertices: int, *, folder: Path | None = None, sour
             pickle; ``mouth_mask.txt>0.1``, the vertices of a file of weights above a threshold; or ``all``. Without
             one, ``lve.txt`` or ``fdd.txt`` is taken, else the masks of FLAME.
     """
-    named = part.replace("_", " ")
     advice = f"give --regions FOLDER with {USUAL[part][0]} or FLAME_masks.pkl in it, or {OPTIONS[part]} FILE"
     root = folder or Path()
     files = {name: root / name.partition(">")[0].partition(":")[0] for name in ([source] if source else USUAL[part])}
-    chosen = next((name for name, path in files.items() if name == ALL or path.is_file()), None)
-    if chosen is None:
-        raise FaceDiffError(f"{' and '.join(map(str, files.values()))}: not there; expected the {named}; {advice}")
-    file, above, threshold = chosen.partition(">")
+    name = next((name for name, path in files.items() if name == ALL or path.is_file()), None)
+    if name is None:
+        noun = part.replace("_", " ")
+        raise FaceDiffError(f"{' and '.join(map(str, files.values()))}: not there; expected the {noun}; {advice}")
+    file, above, threshold = name.partition(">")
     if not above:
-        return find_region(root, [chosen], chosen, n_vertices)
+        return find_region(root, [name], name, n_vertices)
     with errors_of(OPTIONS[part]):
-        region = Region.from_weights(root / file, float(threshold), name=chosen)
+        region = Region.from_weights(root / file, float(threshold), name=name)
         region.check(n_vertices)
     return region
 
@@ -276,7 +266,7 @@ PAIR_FILES: dict[type[LipPairs], tuple[str, str, str]] = {
     LipPairs: (LIP_PAIRS, "--lip-pairs", "lip"),
     EyelidPairs: (EYELID_PAIRS, "--eyelid-pairs", "eyelid"),
 }
-"""Where a corpus has pairs, the option that names another file, and of what they are."""
+"""The corpus's file of pairs, the option for another file, and the kind of vertices."""
 
 
 def read_pairs(source: str | None, corpus: Path | None, n_vertices: int, kind: type[LipPairs] = LipPairs) -> LipPairs:

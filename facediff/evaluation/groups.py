@@ -1,4 +1,4 @@
-"""What clips may be grouped by: the columns of a corpus's ``clips.csv``, or what its naming of files says."""
+"""Attributes to group clips by: the columns of a corpus's ``clips.csv``, or the fields of its file names."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]
     Args:
         corpus: the corpus folder, whose ``clips.csv`` is read if there is one.
         names: of the clips' files, without suffix. Those of 3DMEAD (``M003_001_4_1``: emotion, intensity) and of BIWI
-            (``F2_e37``, ``F2_37``: emotional or neutral) say something by themselves.
+            (``F2_e37``, ``F2_37``: emotional or neutral) hold attributes.
         by: which attributes.
     """
     table = {} if corpus is None else read_clip_table(corpus)
-    by_clip = {name: table[name] if name in table else said_by_name(name) for name in names}
+    by_clip = {name: table[name] if name in table else attributes_of_name(name) for name in names}
     available = sorted({attribute for attributes in by_clip.values() for attribute in attributes})
     for attribute in by:
         if attribute not in available:
@@ -36,8 +36,8 @@ def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]
     }
 
 
-def said_by_name(name: str) -> Mapping[str, str]:
-    """What a clip's name says of it in 3DMEAD and BIWI."""
+def attributes_of_name(name: str) -> Mapping[str, str]:
+    """The attributes in a clip's name in 3DMEAD and BIWI."""
     from facediff.data.mead3d import Mead3D
 
     clip = Mead3D.parse_name(name)

@@ -29,8 +29,8 @@ def holds_parameters(folder: Path) -> bool:
     """Whether a folder's files name their channels or arrays, so that they can only be parameters."""
     if any((folder / name).is_dir() for name in MOTION_FOLDERS):
         return False
-    found = {path.suffix.lower() for path in folder.iterdir()} if folder.is_dir() else set()
-    return ".npy" not in found and bool(found & {*SUFFIXES})
+    suffixes = {path.suffix.lower() for path in folder.iterdir()} if folder.is_dir() else set()
+    return ".npy" not in suffixes and bool(suffixes & {*SUFFIXES})
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class ParameterFiles:
     """How files of one evaluation are read.
 
     Attributes:
-        space: in whose order all files are scored, that of the truth.
+        space: the truth's, with the order of channels in all scores.
         frame_rate: of the truth as it is scored.
         layouts: of the predictions' and of the truth's arrays; None for files that name their channels.
         truth: folder of the truth.
         rig: decodes channels to vertices; None where only channels are scored.
-        predictions: folders of the predictions, which may lie in that of the truth.
+        predictions: folders of the predictions, which may lie in the truth's.
     """
 
     space: Space
@@ -57,14 +57,7 @@ class ParameterFiles:
     def begin(
         cls, truth: Path, layouts: tuple[str | None, str | None], rig: Path | None, stride: int
     ) -> ParameterFiles:
-        """As the first file of a folder of truths says.
-
-        Args:
-            truth: the folder.
-            layouts: of the predictions' and of the truth's arrays; None for files that name their channels.
-            rig: a ``.glb``, a folder of shapes, or FLAME's model file; None to score channels only.
-            stride: of the truth, every frame at a multiple of this number is scored.
-        """
+        """Space and frame rate from the first file of a folder of truths; every ``stride``-th frame is scored."""
         files = sorted(
             path for path in truth.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
         )
@@ -99,7 +92,7 @@ class ParameterFiles:
         return len(self.space.channels) if self.rig is None else len(self._neutral(self.rig))
 
     def _neutral(self, rig: AnyRig, person: npt.NDArray[np.floating] | None = None) -> npt.NDArray[np.float64]:
-        """The face at rest (V, 3), of a person where FLAME's files say whose it is."""
+        """The face at rest (V, 3), of the person in FLAME's files where they name one."""
         if isinstance(rig, LinearRig):
             return rig.neutral
         return rig.template if person is None else rig.shaped(person)
@@ -117,11 +110,11 @@ class ParameterFiles:
         values: npt.NDArray[np.floating] = clip.values
         space = clip.space
         for turn in self.space.rotations:
-            own = next((one for one in space.rotations if one.joint == turn.joint), turn)
-            if own.form != turn.form:
+            stored = next((rotation for rotation in space.rotations if rotation.joint == turn.joint), turn)
+            if stored.form != turn.form:
                 values, space = with_rotations(values, space, turn.form, (turn.joint,))
-        values, found = permuted(values, space, self.space)
-        lacking = sorted(set(found.absent) - set(self.space.absent))
+        values, space = permuted(values, space, self.space)
+        lacking = sorted(set(space.absent) - set(self.space.absent))
         if lacking:
             raise FaceDiffError(f"{path}: lacks the channels {', '.join(lacking[:4])} of the truth; absent is not zero")
         values = values[::stride]
@@ -147,7 +140,7 @@ class ParameterFiles:
     def regions(self, **stated: object) -> dict[str, Region]:
         """Lips and upper face: vertices of a linear rig that their channels move at least half as far as any.
 
-        Without a rig those of the channels themselves; FLAME's must be stated.
+        Without a rig, channels; FLAME's must be stated.
 
         Args:
             stated: regions that a file states, by name, which are left out.
@@ -160,8 +153,8 @@ class ParameterFiles:
         for name in ("lips", "upper_face"):
             if stated.get(name):
                 continue
-            own = {self.space.channels[channel] for channel in self.space.groups[name]}
-            rows = [row for row, channel in enumerate(self.rig.names) if channel in own]
+            channels = {self.space.channels[channel] for channel in self.space.groups[name]}
+            rows = [row for row, channel in enumerate(self.rig.names) if channel in channels]
             if not rows:
                 continue
             sizes = np.linalg.norm(self.rig.deltas[rows], axis=-1).max(0)

@@ -1,6 +1,6 @@
 """Scores of rendered frames by networks that users bring, such as lip-sync and lip-reading models, as graphs of ONNX.
 
-facediff ships no weights. A render metric is a class that says which pictures it wants and scores those of a clip with
+facediff ships no weights. A render metric is a class that states size and part of its pictures and scores a clip with
 its speech; it is registered with ``@facediff.registry.render_metric.register("name")``, and chosen by
 ``facediff evaluate --render name:option=value``. Files are read as those of exported models are: what a graph may cost
 is checked before it is opened, and no code of a file is run.
@@ -8,6 +8,7 @@ is checked before it is opened, and no code of a file is run.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,7 +33,7 @@ Speech = npt.NDArray[np.float32]
 Array = npt.NDArray[np.floating]
 
 
-class RenderMetric:
+class RenderMetric(ABC):
     """Base of scores of rendered frames; a subclass defines :meth:`score`.
 
     Attributes:
@@ -43,6 +44,7 @@ class RenderMetric:
     part: Literal["face", "mouth"] = "face"
     size: tuple[int, int] = (224, 224)
 
+    @abstractmethod
     def score(self, frames: Frames, speech: Speech, frame_rate: float) -> Mapping[str, float]:
         """Scores of one clip by name.
 
@@ -51,7 +53,6 @@ class RenderMetric:
             speech: samples (S,) at 16 kHz, beginning with the first frame; empty if there is none.
             frame_rate: frames a second.
         """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class RenderGraph:
 
 @render_metric.register("onnx")
 class OnnxScores(RenderMetric):
-    """Whatever a graph of ONNX makes of a clip: the mean of each of its outputs is a score of the output's name.
+    """Scores by an ONNX graph: the mean of each output is a score of the output's name.
 
     Its input ``frames`` is (1, T, H, W, 3) with colours from 0 to 1, H and W fixed; an input ``speech``, if it has one,
     is (1, S) at 16 kHz. Lip-reading scores and perceptual ones such as PLRS can be exported in this form.
@@ -95,9 +96,9 @@ class OnnxScores(RenderMetric):
         part: ``face`` or ``mouth``.
     """
 
-    def __init__(self, *, graph: str = "", part: str = "face") -> None:
+    def __init__(self, *, graph: str = "", part: Literal["face", "mouth"] = "face") -> None:
         self.graph = RenderGraph(Path(graph))
-        self.part = cast(Literal["face", "mouth"], _one_of("part", part, "face", "mouth"))
+        self.part = part
         shape = self.graph.inputs.get("frames", [])
         if len(shape) != 5 or shape[4] != 3 or not self.graph.inputs.keys() <= {"frames", "speech"}:
             raise FaceDiffError(
@@ -139,9 +140,11 @@ class SyncScores(RenderMetric):
 
     part = "mouth"
 
-    def __init__(self, *, video: str = "", audio: str = "", order: str = "bgr", reach: int = 15) -> None:
+    def __init__(
+        self, *, video: str = "", audio: str = "", order: Literal["bgr", "rgb"] = "bgr", reach: int = 15
+    ) -> None:
         self.video, self.audio = RenderGraph(Path(video)), RenderGraph(Path(audio))
-        self.order, self.reach = _one_of("order", order, "bgr", "rgb"), reach
+        self.order, self.reach = order, reach
         ends = [list(graph.inputs.items()) for graph in (self.video, self.audio)]
         shapes = [end[0][1] if len(end) == 1 else [] for end in ends]
         self.flat = len(shapes[0]) == 4
@@ -156,24 +159,19 @@ class SyncScores(RenderMetric):
     def score(self, frames: Frames, speech: Speech, frame_rate: float) -> Mapping[str, float]:
         """Both scores and the offset, of one clip."""
         speech_for(self.video, speech)
-        places = np.rint(np.arange(int(len(frames) / frame_rate * 25 + 1e-6)) * frame_rate / 25).astype(int)
-        pictures = frames[places.clip(0, len(frames) - 1)][..., :: -1 if self.order == "bgr" else 1]
+        indices = np.rint(np.arange(int(len(frames) / frame_rate * 25 + 1e-6)) * frame_rate / 25).astype(int)
+        pictures = frames[indices.clip(0, len(frames) - 1)][..., :: -1 if self.order == "bgr" else 1]
         count = min(len(pictures) - 4, (len(speech) - SAMPLE_RATE // 5) // (SAMPLE_RATE // 25) + 1)
         if count < 2 * self.reach:
             raise FaceDiffError(f"a clip of {len(frames)} frames is too short for offsets of {self.reach} frames")
         windows = np.stack([pictures[start : start + 5] for start in range(count)]) / np.float32(255)
         # (N, 5, H, W, 3): colours within pictures, or pictures within colours.
-        seen = windows.transpose(0, 1, 4, 2, 3) if self.flat else windows.transpose(0, 4, 1, 2, 3)
-        seen = seen.reshape(count, 15, *self.size) if self.flat else seen
+        video = windows.transpose(0, 1, 4, 2, 3) if self.flat else windows.transpose(0, 4, 1, 2, 3)
+        video = video.reshape(count, 15, *self.size) if self.flat else video
         mel = mel_spectrogram(speech)
         starts = [min(round(3.2 * start), mel.shape[1] - 16) for start in range(count)]
         sounds = np.stack([mel[None, :, start : start + 16] for start in starts])
-        moving, sounding = self._embeddings(self.video, 0, seen), self._embeddings(self.audio, 1, sounds)
-        if moving.shape != sounding.shape:
-            raise FaceDiffError(
-                f"{self.video.path} and {self.audio.path}: give embeddings {moving.shape} and {sounding.shape}; "
-                f"expected the two encoders of one model"
-            )
+        moving, sounding = self._embeddings(self.video, 0, video), self._embeddings(self.audio, 1, sounds)
         offsets = range(-self.reach, self.reach + 1)
         distances = []
         for offset in offsets:
@@ -220,12 +218,6 @@ def mel_spectrogram(speech: Speech) -> Array:
     return np.asarray(np.clip(8 * (decibels + 100) / 100 - 4, -4, 4), np.float32)
 
 
-def _one_of(name: str, value: str, *allowed: str) -> str:
-    if value not in allowed:
-        raise FaceDiffError(f"{name} is {value!r}; expected {' or '.join(allowed)}")
-    return value
-
-
 def _size(path: str, dims: Sequence[int | str | None]) -> tuple[int, int]:
     if not all(isinstance(size, int) and size > 0 for size in dims):
         raise FaceDiffError(f"{path}: takes pictures of {dims[0]} × {dims[1]}; export it with a fixed height and width")
@@ -248,10 +240,9 @@ def read_render_metrics(texts: Sequence[str]) -> dict[str, RenderMetric]:
 def framing(metric: RenderMetric, template: Array, regions: Mapping[str, Sequence[int]]) -> Camera:
     """The camera of a metric's pictures of a face (V, 3).
 
-    The face is without shoulders, where its ``upper_face`` is known next to its ``lips``; the mouth is what is twice as
-    wide as the lips, in the middle.
+    The face is without shoulders, where its ``upper_face`` is known next to its ``lips``; the mouth is a region twice
+    as wide as the lips, around their middle.
     """
-    whole = Camera.framing(template)
     height, width = metric.size
     if metric.part == "face":
         return Camera.framing(portrait(template, dict(regions)), aspect=width / height)
@@ -259,8 +250,8 @@ def framing(metric: RenderMetric, template: Array, regions: Mapping[str, Sequenc
     middle, half = (mouth.max(0) + mouth.min(0)) / 2, np.ptp(mouth, axis=0)
     half[1] = half[0] * height / width
     camera = Camera.framing(np.stack([middle - half, middle + half]), aspect=width / height, margin=0.0)
-    # What is drawn lies within a radius, which is the head's and not the mouth's.
-    return replace(camera, radius=whole.radius)
+    # The camera draws within a radius: the head's, not the mouth's.
+    return replace(camera, radius=Camera.framing(template).radius)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,23 +278,23 @@ class RenderScorer:
         Args:
             clip: the truth's name, by which its speech is found.
             vertices: (T, V, 3) absolute.
-            template: (V, 3) the face at rest, which the camera is set up for.
+            template: (V, 3) the face at rest, for the camera.
         """
         scores: dict[str, float] = {}
-        drawn: dict[tuple[str, tuple[int, int]], Frames] = {}
+        pictures: dict[tuple[str, tuple[int, int]], Frames] = {}
         for name, metric in self.metrics.items():
             key = (metric.part, metric.size)
-            if key not in drawn:
+            if key not in pictures:
                 camera = framing(metric, template, self.regions)
                 renderer = Renderer(self.faces, template=template, size=metric.size, camera=camera)
-                drawn[key] = np.stack([renderer.render(frame) for frame in vertices])
+                pictures[key] = np.stack([renderer.render(frame) for frame in vertices])
             speech = self.speech(clip)
             speech = speech[: int(len(vertices) / self.frame_rate * SAMPLE_RATE + 1e-6)]
             try:
-                found = metric.score(drawn[key], speech, self.frame_rate)
+                values = metric.score(pictures[key], speech, self.frame_rate)
             except FaceDiffError as error:
                 raise FaceDiffError(f"--render {name}: {clip}: {error}") from error
-            scores |= {f"{name}/{score}": value for score, value in found.items()}
+            scores |= {f"{name}/{score}": value for score, value in values.items()}
         return scores
 
 

@@ -1,4 +1,4 @@
-"""What an evaluation found, as plain data."""
+"""The result of an evaluation, as plain data and as text."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ class MethodResult:
 class Comparison:
     """A method against the first, over the sequences that both have.
 
-    The interval says how the difference depends on the sentences. It says nothing of what another training run of
-    either method would give; where both are runs of one method, all of the difference is that.
+    The interval shows the chance between sentences, not between training runs; where both are runs of one method, the
+    difference is only the latter.
     """
 
     method: str
@@ -114,7 +114,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class GroupScores:
-    """The scores of one method over clips whose attributes are equal."""
+    """The scores of one method over clips with equal attributes."""
 
     method: str
     attributes: dict[str, str]
@@ -124,7 +124,7 @@ class GroupScores:
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """What an evaluation found."""
+    """The result of an evaluation."""
 
     truth: str  # the folder of truths
     lips: Region
@@ -176,13 +176,13 @@ class EvaluationReport:
         return [sequence.row() for method in self.methods for sequence in method.sequences]
 
 
-# The values of all clips of a method, and what becomes of them.
+# The values of all clips of a method, pooled and compared.
 
 
 class MethodTable:
     """One method's values: a row a clip, sorted by clip, so that no order of files or workers changes a digit.
 
-    ``clip_scores`` has the scores by clip, or in words why there are none; ``missing`` what names alone rule out.
+    ``clip_scores`` has the scores by clip, or the reason why there are none; ``unscored`` follows from file names.
     """
 
     def __init__(
@@ -190,13 +190,13 @@ class MethodTable:
         name: str,
         folder: str,
         pairs: Sequence[Pair],
-        missing: Missing,
+        unscored: Missing,
         clip_scores: Mapping[str, ClipScores | str],
         columns: Sequence[Column],
     ) -> None:
         self.name, self.folder, self.columns = name, folder, columns
         unusable = {clip: reason for clip, reason in sorted(clip_scores.items()) if isinstance(reason, str)}
-        self.missing = replace(missing, unusable=unusable)
+        self.missing = replace(unscored, unusable=unusable)
         self.provenance = read_provenance(Path(folder))
         self.rows = [(pair, scores) for pair in pairs if isinstance(scores := clip_scores[pair.clip], ClipScores)]
         if not self.rows:
@@ -212,8 +212,8 @@ class MethodTable:
 
     def _by_name(self, values: Iterable[float]) -> dict[str, float | None]:
         """Values of all columns by name, without those that single clips do not have."""
-        named = zip(self.columns, values, strict=True)
-        return {column.name: None if math.isnan(v) else v for column, v in named if self._pooled(column)}
+        pairs = zip(self.columns, values, strict=True)
+        return {column.name: None if math.isnan(v) else v for column, v in pairs if self._pooled(column)}
 
     def groups(self, attributes: Mapping[str, dict[str, str]]) -> list[GroupScores]:
         """The scores of clips with equal attributes, by the name of the truth's file; pooled as over all clips."""
@@ -257,35 +257,35 @@ class MethodTable:
     def _totals(self) -> list[float]:
         """The score of each column over all clips."""
         totals: list[float] = self.table.pool().tolist()
-        for place, column in enumerate(self.columns):
+        for index, column in enumerate(self.columns):
             if not self._pooled(column):
-                whole = self.rows[0][1].states[column.source].clone()
+                metric = self.rows[0][1].states[column.source].clone()
                 with errors_of(f"{self.folder}: metric {column.metric}"):
                     for _, scores in self.rows[1:]:
-                        whole.merge_state(scores.states[column.source])
-                    totals[place] = float(whole.compute())
-            elif math.isnan(totals[place]):
+                        metric.merge_state(scores.states[column.source])
+                    totals[index] = float(metric.compute())
+            elif math.isnan(totals[index]):
                 raise FaceDiffError(
                     f"{self.folder}: metric {column.metric} has no value on any of its {len(self.rows)} clips; omit it"
                 )
         return totals
 
     def compare(self, baseline: MethodTable, bootstrap: Bootstrap) -> list[Comparison]:
-        """This method's scores minus another's, over the clips of which both have a value and over the same resamples.
+        """This method's scores minus another's, over the clips with a value in both and over the same resamples.
 
         Empty if they share no clip.
         """
-        ours, theirs = self.table.common(baseline.table)
-        if not ours.clips:
+        table, reference = self.table.common(baseline.table)
+        if not table.clips:
             return []
-        one, other = ours.resampled(bootstrap), theirs.resampled(bootstrap)
-        spread = None if one is None or other is None else one - other
+        one, two = table.resampled(bootstrap), reference.resampled(bootstrap)
+        spread = None if one is None or two is None else one - two
         same = same_method(self.provenance, baseline.provenance)
         facts = zip(
             self.columns,
-            (ours.pool() - theirs.pool()).tolist(),
+            (table.pool() - reference.pool()).tolist(),
             bootstrap.intervals(spread, len(self.columns)),
-            np.count_nonzero(ours.weights, axis=0).tolist(),
+            np.count_nonzero(table.weights, axis=0).tolist(),
             strict=True,
         )
         return [
@@ -295,9 +295,9 @@ class MethodTable:
         ]
 
 
-def same_method(one: Provenance | None, other: Provenance | None) -> bool:
+def same_method(one: Provenance | None, two: Provenance | None) -> bool:
     """Whether two folders are known to be of two training runs of one method."""
-    return one is not None and other is not None and one.checkpoint != other.checkpoint and one.same_method(other)
+    return one is not None and two is not None and one.checkpoint != two.checkpoint and one.same_method(two)
 
 
 def runs_of(methods: Sequence[MethodResult]) -> list[Runs]:
@@ -325,25 +325,22 @@ def _runs_of(methods: Sequence[MethodResult], scores: Sequence[Score]) -> Runs:
     return Runs(names, seeds, scores[0].protocol, scores[0].metric, float(values.mean()), float(values.std(ddof=1)))
 
 
-def _why_nothing(missing: Missing) -> str:
-    """One sentence for a method of which nothing can be scored: the first thing that stands in the way."""
-    if missing.unusable:
-        clip, reason = next(iter(missing.unusable.items()))
-        return f"nothing can be scored; of {clip}: {reason}"
-    if missing.unused:
-        return (
-            f"no prediction has the condition asked for, but {missing.unused[0]} is there; choose --identity all or "
-            f"an identity's name"
-        )
-    if missing.without_truth:
-        return f"no prediction has a truth, {missing.without_truth[0]} for one; check --truth-pattern and the folders"
-    example = missing.unnamed[0] if missing.unnamed else "no file"
-    return f"no file's name is understood, {example} for one; say with --pattern how files are named"
+def _why_nothing(unscored: Missing) -> str:
+    """The first reason why no clip of a method can be scored."""
+    if unscored.unusable:
+        clip, reason = next(iter(unscored.unusable.items()))
+        return f"no clip can be scored; {clip}: {reason}"
+    if unscored.unused:
+        return f"no prediction has this condition, but {unscored.unused[0]} is there; give --identity all or a name"
+    if unscored.without_truth:
+        return f"no prediction has a truth, such as {unscored.without_truth[0]}; check --truth-pattern and the folders"
+    example = f", such as {unscored.unnamed[0]}" if unscored.unnamed else ""
+    return f"no file's name fits the pattern{example}; give --pattern"
 
 
 # An evaluation as text for people.
 
-SHOWN = 5  # Names that are listed before the rest is counted
+LISTED = 5  # Names that are listed before the rest is counted
 
 
 def text(report: EvaluationReport) -> str:
@@ -355,8 +352,8 @@ def text(report: EvaluationReport) -> str:
     ]
     for part, region in report.regions().items():
         again = f", {region['duplicates']} repeated in the source" if region["duplicates"] else ""
-        counted = f"{region['count']} {report.points}, hash {region['hash']}{again}"
-        lines.append(f"{part.replace('_', ' ')} {region['name']}: {counted}")
+        size = f"{region['count']} {report.points}, hash {region['hash']}{again}"
+        lines.append(f"{part.replace('_', ' ')} {region['name']}: {size}")
     lines += report.remarks
     for name in report.protocols:
         title = "further metrics" if name == METRICS else f"protocol {name}"
@@ -367,15 +364,15 @@ def text(report: EvaluationReport) -> str:
             "",
             f"[…]: {report.level:.0%} intervals, {report.resamples} bootstrap resamples of the sequences, "
             f"seed {report.seed}",
-            "they say how much depends on the sentences; the spread over training runs is given apart"
+            "they show the chance between sentences; the spread over training runs is separate"
             if report.runs
-            else "they say how much depends on the sentences, and nothing of the chance between training runs",
+            else "they show the chance between sentences, not the chance between training runs",
         ]
     if report.renders:
         names = list(dict.fromkeys(name for scores in report.renders.values() for name in scores))
         rows = [[who, *(f"{scores[name]:.4e}" for name in names)] for who, scores in report.renders.items()]
         lines += ["", "on renders, mean over clips", *format_table(["", *names], rows).splitlines()]
-    lines += ["", *(_left_out(report) or ["everything there was scored; nothing was cut, skipped or missing"])]
+    lines += ["", *(_left_out(report) or ["every clip was scored; no frame was cut"])]
     lines = [printable(line) for line in lines]
     for definition in report.protocols.values():
         lines += ["", definition]
@@ -404,18 +401,20 @@ def _scores(report: EvaluationReport, protocol: str) -> list[str]:
     if protocol == METRICS or len(scored[0]) > MOST_COLUMNS:
         for same in zip(*scored, strict=True):
             cells = {
-                method.name: _cell(own.value, own.interval) for method, own in zip(report.methods, same, strict=True)
+                method.name: _cell(score.value, score.interval)
+                for method, score in zip(report.methods, same, strict=True)
             }
-            rows[same[0].metric] = cells | {"sequences": "/".join(dict.fromkeys(str(own.sequences) for own in same))}
+            counts = dict.fromkeys(str(score.sequences) for score in same)
+            rows[same[0].metric] = cells | {"sequences": "/".join(counts)}
         return _table(rows, ["sequences"])
     for method, scores in zip(report.methods, scored, strict=True):
-        counts = {"frames": str(scores[0].frames), "sequences": str(scores[0].sequences)}
-        rows[method.name] = {score.metric: _cell(score.value, score.interval) for score in scores} | counts
+        totals = {"frames": str(scores[0].frames), "sequences": str(scores[0].sequences)}
+        rows[method.name] = {score.metric: _cell(score.value, score.interval) for score in scores} | totals
     return _table(rows, ["frames", "sequences"])
 
 
 def _groups(report: EvaluationReport, protocol: str) -> list[str]:
-    """Scores by the attributes asked for; those of groups side by side, method by method."""
+    """Scores by attributes of clips, group by group and method by method."""
     by = list(report.groups[0].attributes) if report.groups else []
     names = [name for name in (report.groups[0].scores if by else ()) if name.partition("/")[0] == protocol]
     if not names:
@@ -477,26 +476,26 @@ def _left_out(report: EvaluationReport) -> list[str]:
 
 
 def _table_method(method: MethodResult) -> list[str]:
-    missing = method.missing
+    unscored = method.missing
     cut = [
         f"{sequence.clip} (prediction {sequence.cut_prediction}, truth {sequence.cut_truth})"
         for sequence in method.sequences
         if sequence.cut_prediction or sequence.cut_truth
     ]
-    listed = {
+    names_of = {
         "frames cut": cut,
-        "clips without a prediction": missing.without_prediction,
-        "predictions without a truth": missing.without_truth,
-        "predictions under other conditions": missing.unused,
-        "files whose names do not fit": missing.unnamed,
+        "clips without a prediction": unscored.without_prediction,
+        "predictions without a truth": unscored.without_truth,
+        "predictions under other conditions": unscored.unused,
+        "files whose names do not fit": unscored.unnamed,
     }
-    lines = [f"{what}: {_names(names)}" for what, names in listed.items() if names]
-    unusable = [f"{clip} is left out: {reason}" for clip, reason in missing.unusable.items()]
-    more = [f"{len(unusable) - SHOWN} more are left out (--json lists all)"] if len(unusable) > SHOWN else []
-    return lines + unusable[:SHOWN] + more
+    lines = [f"{title}: {_names(names)}" for title, names in names_of.items() if names]
+    unusable = [f"{clip} is left out: {reason}" for clip, reason in unscored.unusable.items()]
+    more = [f"{len(unusable) - LISTED} more are left out (--json lists all)"] if len(unusable) > LISTED else []
+    return lines + unusable[:LISTED] + more
 
 
 def _names(names: Sequence[str]) -> str:
     """How many, and the first few."""
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return f"{len(names)}: {', '.join(names[:SHOWN])}{more}"
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return f"{len(names)}: {', '.join(names[:LISTED])}{more}"

@@ -61,7 +61,7 @@ class Column:
 
 @dataclass(frozen=True)
 class ClipScores:
-    """What one clip gave, the mean over its conditions where there are several."""
+    """The scores of one clip, the mean over its conditions where there are several."""
 
     values: tuple[float, ...]  # a value for each column; NaN where the metric has none on this clip
     weights: tuple[float, ...]  # frames behind it, for pooling by frames
@@ -74,38 +74,33 @@ class ClipScores:
 
 @dataclass(frozen=True)
 class Motion:
-    """What a file holds, as vertices or channels or both."""
+    """The motion of a file, as vertices or channels or both."""
 
     vertices: Tensor | None = None  # (T, V, 3) absolute
     channels: Tensor | None = None  # (T, C, 1)
     template: Tensor | None = None  # (V, 3) the person's neutral face, where the file says it
 
     def get(self, *, channels: bool) -> Tensor:
-        """The one or the other."""
-        motion = self.channels if channels else self.vertices
-        if motion is None:
-            raise FaceDiffError(
-                "the files hold vertices, and no channels" if channels else "the files hold channels, and no vertices"
-            )
-        return motion
+        """The one or the other, which the protocols and metrics have been checked against."""
+        return cast(Tensor, self.channels if channels else self.vertices)
 
 
 class Scorer:
-    """Scores clips by several protocols; what two protocols share is computed once.
+    """Scores clips by several protocols; values that two protocols share are computed once.
 
     May be used by several threads at the same time.
 
     Args:
-        protocols: what to compute.
+        protocols: of the scores.
         lips: lip vertices.
         upper_face: upper-face vertices; None if no protocol has FDD.
         templates: neutral face (V, 3) by identity; empty if no protocol has FDD.
         n_vertices: vertices of the mesh.
         truth_stride: 2 takes every second frame of the truth, and so on.
         metrics: further metrics by name, made for the corpus.
-        inputs: gives what these read of a clip in addition to its motion.
+        inputs: gives their inputs of a clip besides its motion.
         moments: in which frames a metric of that name is taken, where not in all.
-        owners: the protocol that each of these belongs to, and its name there; none of those chosen by name.
+        owners: protocol and label of each of these that a protocol names.
         read: reads a file, every ``stride``-th frame of it; None for files of vertices.
         channels: regions ``lips`` and ``upper_face`` of channels, for protocols of channels.
         scales: factor of lengths of each protocol, by its name.
@@ -156,22 +151,22 @@ class Scorer:
         )
         if self.needs_template and not templates:
             raise FaceDiffError("FDD needs each speaker's neutral face: give --templates, or a protocol without FDD")
-        self.chosen = dict(metrics or {})
+        self.further = dict(metrics or {})
         self.inputs = inputs
-        for name, chosen in self.chosen.items():
-            over = chosen.over if isinstance(chosen, SequenceMetric) else None
-            of_channels = bool(getattr(chosen, "of_channels", False))
+        for name, further in self.further.items():
+            over = further.over if isinstance(further, SequenceMetric) else None
+            of_channels = bool(getattr(further, "of_channels", False))
             if over is not None and not of_channels:
                 with errors_of(f"metric {name}"):
                     over.check(n_vertices)
-            pooling: Pooling = getattr(chosen, "pooling", "sequences")
+            pooling: Pooling = getattr(further, "pooling", "sequences")
             where = "all vertices" if over is None else over.as_dict()
-            better = describe_column(chosen)["better"]
+            better = describe_column(further)["better"]
             protocol_name, label = self.owners.get(name, (METRICS, name))
             facts: dict[str, Any] = {"region": where, "better": better, "channels": of_channels, "by_name": True}
             self.columns.append(Column(protocol_name, label, pooling, "min", name, **facts))
         self.needs_template |= read is None and any(
-            "template" in getattr(chosen, "needs", ()) for chosen in self.chosen.values()
+            "template" in getattr(further, "needs", ()) for further in self.further.values()
         )
 
     def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:
@@ -197,7 +192,7 @@ class Scorer:
         )
 
     def score(self, pair: Pair) -> ClipScores | str:
-        """The scores of a clip, or in words why it has none: a file of it cannot be used."""
+        """The scores of a clip, or the reason why a file of it cannot be used."""
         subject = pair.truth.name.subject
         template = self.templates.get(subject)
         if self.needs_template and template is None:
@@ -206,44 +201,44 @@ class Scorer:
             truth = self.read(pair.truth.path, self.truth_stride)
             predictions = {condition: self.read(path, 1) for condition, path in pair.predictions.items()}
             template = template if truth.template is None else truth.template
-            inputs = self.inputs(pair) if self.chosen else {}
+            inputs = self.inputs(pair) if self.further else {}
         except FaceDiffError as error:
             return str(error)
-        done = [
+        scored = [
             self._score(pair.predictions[condition].stem, prediction, truth, template)
             for condition, prediction in predictions.items()
         ]
-        weights = np.array([scores.weights for scores in done])
-        values = np.array([scores.values for scores in done])
+        weights = np.array([scores.weights for scores in scored])
+        values = np.array([scores.values for scores in scored])
         by_frames = np.array([column.pooling == "frames" for column in self.columns[: values.shape[1]]])
         # A condition's share of the clip is its frames where all frames count alike; they differ only if one was cut.
         shares = np.where(by_frames, weights, 1.0)
-        further, states = self._chosen(pair, truth, predictions, inputs | {"template": template})
+        by_name, states = self._further(pair, truth, predictions, inputs | {"template": template})
         return ClipScores(
-            (*((values * shares).sum(0) / shares.sum(0)).tolist(), *(value for value, _ in further)),
-            (*weights.mean(0).tolist(), *(weight for _, weight in further)),
-            sum(scores.frames for scores in done),
-            sum(scores.cut_prediction for scores in done),
-            sum(scores.cut_truth for scores in done),
+            (*((values * shares).sum(0) / shares.sum(0)).tolist(), *(value for value, _ in by_name)),
+            (*weights.mean(0).tolist(), *(weight for _, weight in by_name)),
+            sum(scores.frames for scores in scored),
+            sum(scores.cut_prediction for scores in scored),
+            sum(scores.cut_truth for scores in scored),
             states,
         )
 
-    def _chosen(
+    def _further(
         self, pair: Pair, truth: Motion, predictions: Mapping[str, Motion], inputs: dict[str, Any]
     ) -> tuple[list[tuple[float, float]], dict[str, Metric]]:
         """Value and weight of a clip under each metric chosen by name, and the metrics that have no such values."""
         valued: list[tuple[float, float]] = []
         states: dict[str, Metric] = {}
-        for name, chosen in self.chosen.items():
-            one = chosen.clone()
-            channels = bool(getattr(chosen, "of_channels", False))
+        for name, metric in self.further.items():
+            one = metric.clone()
+            channels = bool(getattr(metric, "of_channels", False))
             moment = self.moments.get(name, "all")
             with errors_of(f"metric {name}"):
-                if "conditions" in getattr(chosen, "needs", ()):
+                if "conditions" in getattr(metric, "needs", ()):
                     motions = [motion.get(channels=channels) for motion in predictions.values()]
                     frames = min(map(len, motions))
-                    several = torch.stack([motion[:frames] for motion in motions])
-                    feed(one, {"predictions": several, "clip_names": [pair.clip]})
+                    conditions = torch.stack([motion[:frames] for motion in motions])
+                    feed(one, {"predictions": conditions, "clip_names": [pair.clip]})
                 else:
                     for condition, motion in predictions.items():
                         clip_names = [pair.predictions[condition].stem]
@@ -299,7 +294,7 @@ class Scorer:
         return Motion(read_vertices(path, self.n_vertices, stride))
 
     def _values(self, clips: Clips, metrics: Mapping[str, SequenceMetric]) -> dict[str, float]:
-        """What each source says of the one clip."""
+        """The value of each source on one clip."""
         clip = clips.clips[0]
         errors = {source: metric for source, metric in metrics.items() if isinstance(metric, VertexError)}
         dynamics = {source: metric for source, metric in metrics.items() if isinstance(metric, FaceDynamicsDeviation)}
@@ -312,17 +307,17 @@ class Scorer:
         )
         by_source = dict(zip([*errors, *dynamics], torch.stack([*means, *deviations]).tolist(), strict=True))
         # An error over all vertices is finite only if every value of the frames is: the clip need not be read again.
-        whole = [by_source[source] for source, metric in errors.items() if metric.region is None]
-        if not whole or not all(map(math.isfinite, by_source.values())):
+        complete = any(metric.region is None for metric in errors.values())
+        if not complete or not all(map(math.isfinite, by_source.values())):
             with errors_of(f"protocol {self.columns[0].protocol}"):
                 clips.check_finite()
-        others = metrics.keys() - by_source.keys()
-        return by_source | {source: float(metrics[source].clip_value(clip)) for source in others}
+        remaining = metrics.keys() - by_source.keys()
+        return by_source | {source: float(metrics[source].clip_value(clip)) for source in remaining}
 
 
 def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:
     """Absolute vertices (T, V, 3) of a file that holds (T, 3V) or (T, V, 3) in any float type, memory-mapped."""
-    # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing is ever written to them.
+    # torch warns of arrays that cannot be written; copy-on-write ones can, and nothing writes to them.
     array = open_vertices(path, n_vertices, mode="c")[::stride]
     if array.dtype not in NATIVE or not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("=") if array.dtype.itemsize <= 8 else np.float64)
@@ -344,18 +339,10 @@ def score_all(
     reads: Sequence[Path] = (),
     progress: bool = False,
 ) -> dict[str, dict[str, ClipScores | str]]:
-    """What the scorer says of every job, by method and clip.
+    """The scores of every job, by method and clip.
 
     On one machine, the workers are threads: nearly all of the time is spent in torch, which lets other threads
     run, and a thread starts immediately where a process would take seconds, and a hundred megabytes, to import torch.
-
-    Args:
-        scorer: scores a clip.
-        jobs: method and clip.
-        workers: clips that are scored at a time; as many as processors if None.
-        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
-        reads: the folders of the clips, which workers of a cluster must see.
-        progress: whether to show a bar.
     """
     by_method: dict[str, dict[str, ClipScores | str]] = {method: {} for method, _ in jobs}
     results = run_tasks(

@@ -147,15 +147,6 @@ def test_facediffuser_on_the_weights_of_beat(tmp_path: Path, capsys: pytest.Capt
     assert "ann_a is left out" in capsys.readouterr().out
 
 
-def test_a_protocol_of_channels_refuses_vertices(tmp_path: Path) -> None:
-    for folder in ("truth", "ours"):
-        (tmp_path / folder).mkdir()
-        np.save(tmp_path / folder / "ann_a.npy", np.zeros((3, 4, 3), np.float32))
-    words = [tmp_path / "ours", tmp_path / "truth", "--lips", "all", "--n-vertices", "4"]
-    assert "channels" in refused(*words, "--protocol", "facediffuser_beat")
-    assert "--file-unit" in refused(*words, "--protocol", "meshtalk", "--unit", "mm")
-
-
 def test_mask_and_partner_have_the_stride_of_the_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     random = np.random.default_rng(4)
     truth, partner = random.uniform(0, 1, (2, 40, 51)).astype(np.float32)

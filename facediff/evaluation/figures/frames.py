@@ -25,18 +25,19 @@ def find_phoneme(selector: str, phonemes: Sequence[TimedPhoneme], clip: str) -> 
     that of a viseme, ``PP``.
     """
     name, _, number = selector.rpartition(":") if re.search(r".:\d+$", selector) else (selector, "", "1")
-    place, spoken = int(number), [phoneme for phoneme in phonemes if phoneme.ipa]
+    rank, spoken_phonemes = int(number), [phoneme for phoneme in phonemes if phoneme.ipa]
     for same in (
         lambda p: p.ipa == name,
         lambda p: p.plain == name.strip(STRESS),
         lambda p: _without_marks(p.ipa) == _without_marks(name),
         lambda p: name in p.viseme.split("+"),
     ):
-        matches = [phoneme for phoneme in spoken if same(phoneme)]
-        if 1 <= place <= len(matches):
-            return matches[place - 1]
-    symbols = dict.fromkeys(phoneme.plain for phoneme in spoken)
-    raise FaceDiffError(f'phoneme "{selector}": not spoken, or not so often, in clip {clip}: {choices(name, symbols)}')
+        matches = [phoneme for phoneme in spoken_phonemes if same(phoneme)]
+        if 1 <= rank <= len(matches):
+            return matches[rank - 1]
+    symbols = dict.fromkeys(phoneme.plain for phoneme in spoken_phonemes)
+    reason = choices(name, symbols) if symbols else "its phonemes are not known; give --phoneme-file"
+    raise FaceDiffError(f'phoneme "{selector}": not spoken, or not so often, in clip {clip}: {reason}')
 
 
 def _without_marks(ipa: str) -> str:
@@ -78,9 +79,8 @@ def pick_frames(material: FigureData, clip: str, moments: Sequence[Moment]) -> d
             frame, path = frame_at(moment.time, material.rate), material.path(clip, name)
             if not 0 <= frame < len(motion):
                 raise FaceDiffError(
-                    f"{path}: has no frame at {moment.time:g} s; {name} lasts from 0 to "
-                    f"{len(motion) / material.rate:g} s ({len(motion)} frames at {material.rate:g} a "
-                    f"second; give --frame-rate if that is another)"
+                    f"{path}: has no frame at {moment.time:g} s; {name} has {len(motion)} frames at "
+                    f"{material.rate:g} a second; give --frame-rate if it is another"
                 )
             picked[name].append(np.asarray(motion[frame], np.float64))
     return picked
@@ -117,7 +117,7 @@ def draw_frames(
         grid = Grid(paper, material.names, headings, aspect=painter.aspect, highest=HIGHEST, remark=material.remark)
         painter.set_size(*grid.pixels)
         figure = grid.draw_labels()
-        for row, shown in enumerate(picked.values()):
-            for column, face in enumerate(shown):
+        for row, motion in enumerate(picked.values()):
+            for column, face in enumerate(motion):
                 grid.picture(painter.paint(face), row, column)
         save(figure, output)

@@ -1,4 +1,4 @@
-"""Finding what figures need in addition to the files of vertices: templates, mesh, frame rate, sound, phonemes."""
+"""Finds the templates, mesh, frame rate, sound and phonemes of figures."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def gather(
     truth_stride: ranges.Stride | None = None,
     unit: str | None = None,
 ) -> FigureData:
-    """Find truth, methods and what is known about their mesh; where an option is None, the corpus says it.
+    """Find truth, methods and their mesh; where an option is None, the corpus says it.
 
     Args:
         methods: each method's folder of predictions.
         truth: a corpus folder, any folder of .npy files, or ``puppet``, the built-in corpus in the user's cache folder.
         patterns: how predictions are named.
         truth_pattern: how truths are named.
-        identity: whose style the predictions were given.
+        identity: the style of the predictions.
         topology: the corpus that the mesh belongs to.
         templates: file of each speaker's neutral face.
         mesh: file with the faces.
@@ -103,7 +103,7 @@ def phonemes_of(material: FigureData, clip: str, file: Path | None = None) -> li
 
 
 def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> SpeechMotionDataModule | None:
-    """The data module whose topology this is; None if it is not recognised. Which of several the folder decides."""
+    """The data module of this topology; None if it is not recognised. The folder decides between several."""
     folder = list_folder(root, MOTION_FOLDERS)
     if name is not None:
         if "." in name:
@@ -123,9 +123,9 @@ def _find_mesh(path: Path | None, root: Path, module: SpeechMotionDataModule | N
         if len(mesh.vertices) != n_vertices:
             raise FaceDiffError(f"{path}: has {len(mesh.vertices)} vertices, the motion {n_vertices}; give its mesh")
         return mesh
-    places = [root, root / "templates"]
-    files = [place / file for file in (module.mesh_files if module else ()) for place in places]
-    files += [file for place in places for file in sorted(place.glob("*")) if file.suffix.lower() in SUFFIXES]
+    folders = [root, root / "templates"]
+    files = [folder / file for file in (module.mesh_files if module else ()) for folder in folders]
+    files += [file for folder in folders for file in sorted(folder.glob("*")) if file.suffix.lower() in SUFFIXES]
     for file in files:
         if file.is_file() and len((mesh := read_mesh(file)).vertices) == n_vertices:
             return mesh

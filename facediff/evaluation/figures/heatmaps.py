@@ -40,18 +40,10 @@ class VertexMap:
 def motion_maps(
     material: FigureData, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
 ) -> tuple[dict[str, VertexMap], list[str]]:
-    """How far each vertex is from the identity's template, over all frames of the clips, of truth and methods.
+    """The distance of each vertex from the template over all frames of the clips, by name, truth first; and notes.
 
-    Where lengths differ, the frames that all have are used, so that the panels of a figure are comparable.
-
-    Args:
-        material: the clips' files.
-        clips: names of clips.
-        workers: clips at a time; as many as processors, or workers of a cluster, if None. Digits do not depend on it.
-        scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
-
-    Returns:
-        a map by name, the truth's first; and notes on frames that were left out.
+    Where lengths differ, only common frames are used, so that the panels of a figure are comparable. Digits do not
+    depend on ``workers`` or ``scheduler`` (:func:`facediff.utils.jobs.run_tasks`).
     """
     return _vertex_maps(material, clips, material.names, _from_template, workers, scheduler)
 
@@ -67,26 +59,16 @@ def _from_template(
 def error_maps(
     material: FigureData, clips: Sequence[str], *, workers: int | None = None, scheduler: str | None = ""
 ) -> tuple[dict[str, VertexMap], list[str]]:
-    """How far each vertex is from the truth's, over all frames of the clips, of every method.
-
-    Args:
-        material: the clips' files.
-        clips: names of clips.
-        workers: as of :func:`motion_maps`.
-        scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
-
-    Returns:
-        a map by method; and notes on frames that were left out.
-    """
+    """The distance of each vertex from the truth's over all frames of the clips, by method; and notes."""
     return _vertex_maps(material, clips, list(material.methods), _from_truth, workers, scheduler)
 
 
 def _from_truth(
     material: FigureData, clip: str, name: str, motions: Mapping[str, Tensor], frames: int
 ) -> Iterator[Array]:
-    true = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
-    for one, other in zip(chunks(motions[name], material.path(clip, name), frames), true, strict=True):
-        yield np.linalg.norm(one - other, axis=2)
+    truths = chunks(motions[TRUTH], material.path(clip, TRUTH), frames)
+    for part, truth in zip(chunks(motions[name], material.path(clip, name), frames), truths, strict=True):
+        yield np.linalg.norm(part - truth, axis=2)
 
 
 Distances = Callable[[FigureData, str, str, Mapping[str, Tensor], int], Iterator[Array]]
@@ -95,7 +77,7 @@ Distances = Callable[[FigureData, str, str, Mapping[str, Tensor], int], Iterator
 
 @dataclass(frozen=True)
 class _Part:
-    """What some frames in a row add to the statistics of every vertex."""
+    """The statistics of every vertex over some consecutive frames."""
 
     frames: int
     mean: Array  # (V,)
@@ -106,7 +88,7 @@ class _Part:
 def _parts(
     material: FigureData, distances: Distances, names: Sequence[str], task: tuple[int, str]
 ) -> tuple[str, list[list[_Part]]]:
-    """What a clip, numbered since it may be asked for twice, adds, by name; and a note on frames that are left out."""
+    """The statistics of a clip, by name, and a note on omitted frames; numbered, since clips may repeat."""
     _, clip = task
     motions = material.open(clip)
     frames, note = shortest(motions)
@@ -170,7 +152,7 @@ def draw_heatmap(
 
     Args:
         material: what to draw from.
-        clips: clips whose frames count.
+        clips: names of clips.
         output: ``.png``, ``.pdf`` or ``.svg``.
         paper: width, resolution and font.
         view: a name in :data:`facediff.render.VIEWS`.
@@ -205,10 +187,10 @@ def draw_error(
     row each, and ``highest`` has the ends of the colour scales of mean and maximum.
     """
     rows = {"mean error": "mean", "maximum error": "maximum"}
-    chosen = {label: name for label, name in rows.items() if label.startswith(statistic) or statistic == "both"}
+    selected = {label: name for label, name in rows.items() if label.startswith(statistic) or statistic == "both"}
     ends = (highest[1], None) if statistic == "max" else highest
     reading = partial(error_maps, workers=workers, scheduler=scheduler)
-    return _draw_maps(material, clips, output, reading, chosen, ends, paper or Paper(), view)
+    return _draw_maps(material, clips, output, reading, selected, ends, paper or Paper(), view)
 
 
 def _draw_maps(
@@ -225,11 +207,11 @@ def _draw_maps(
     check_output(output)
     material.mesh(clips)  # refuses before the work
     maps, notes = reading(material, clips)
-    drawn: list[Row] = [
+    pictures: list[Row] = [
         (label, {name: getattr(vertex_map, attribute) for name, vertex_map in maps.items()}, end)
         for (label, attribute), end in zip(rows.items(), highest, strict=False)
     ]
-    _draw(material, clips, drawn, output, paper, view)
+    _draw(material, clips, pictures, output, paper, view)
     return notes
 
 

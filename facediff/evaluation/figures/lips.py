@@ -57,7 +57,7 @@ def opening_curves(material: FigureData, clip: str, pairs: LipPairs) -> tuple[Cu
     """The opening of truth and methods in a clip: the mean distance of the pairs, as in `MouthOpeningDifference`.
 
     Returns:
-        the curves in the length that all have; and a note if lengths differ.
+        the curves in the common length; and a note if lengths differ.
     """
     motions = material.open(clip)
     frames, note = shortest(motions)
@@ -103,7 +103,7 @@ def draw_lips(
         sound: speech and phonemes.
         output: ``.png``, ``.pdf`` or ``.svg``.
         paper: width, resolution and font.
-        scale: what openings are multiplied by, and the resulting unit.
+        scale: factor of the openings, and the resulting unit.
         span: first and last second; the whole clip if None.
         remark: small text below everything.
     """

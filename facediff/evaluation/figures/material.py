@@ -1,4 +1,4 @@
-"""What figures are drawn from: the clips of truth and methods and their mesh; and the painter of that mesh."""
+"""The data of figures: the clips of truth and methods and their mesh; and the painter of that mesh."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FigureData:
-    """The files of truth and methods, and what is known about them."""
+    """The files of truth and methods, with their mesh, templates and frame rate."""
 
     truths: dict[str, Truth]  # truths by clip, ``<subject>_<sentence>``
     # Each method's predictions by clip; methods in the order in which they are drawn.
@@ -86,7 +86,7 @@ class FigureData:
         return self.frame_rate
 
     def choose(self, clips: Sequence[str] | None = None) -> list[str]:
-        """Clips to draw: those asked for, else all that the truth and every method have."""
+        """Clips to draw: the given ones, else all that the truth and every method have."""
         sets: dict[str, Mapping[str, object]] = {TRUTH: self.truths, **self.methods}
         if clips is None:
             clips = [clip for clip in self.truths if all(clip in files for files in sets.values())]
@@ -99,7 +99,7 @@ class FigureData:
             for name, files in sets.items():
                 if clip not in files:
                     raise FaceDiffError(f'{name} has no clip "{clip}": {few(files, clip)}')
-        return list(dict.fromkeys(clips))  # one that was named twice counts once
+        return list(dict.fromkeys(clips))
 
     def open(self, clip: str) -> dict[str, Tensor]:
         """Absolute vertices (T, V, 3) of the truth and of each method, memory-mapped, each in its own length."""
@@ -116,8 +116,8 @@ class FigureData:
         """Neutral face (V, 3) of a clip's speaker."""
         subject = self.truths[clip].name.subject
         if subject not in self.templates:
-            known = f" with {subject}, not only {', '.join(self.templates)}" if self.templates else ""
-            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; give --templates FILE{known}")
+            speakers = f" with {subject}, not only {', '.join(self.templates)}" if self.templates else ""
+            raise FaceDiffError(f"no template of {subject}, needed by clip {clip}; give --templates FILE{speakers}")
         return np.asarray(self.templates[subject], np.float64)
 
     def mesh(self, clips: Sequence[str]) -> tuple[npt.NDArray[np.int32], Array]:
@@ -142,7 +142,7 @@ def find_clips(
 ) -> tuple[dict[str, Truth], dict[str, dict[str, Path]]]:
     """Truths by clip and each method's predictions by clip, matched by their names as ``facediff evaluate`` does.
 
-    ``subjects`` are the known speakers; ``identity`` is ``own``, or the identity whose predictions are drawn.
+    ``subjects`` are the known speakers; ``identity`` is ``own``, or a condition of the predictions.
     """
     problem = f'a method cannot be called "{TRUTH}"; name it with NAME=FOLDER' if TRUTH in methods else ""
     if identity == ALL:
@@ -166,7 +166,7 @@ def find_clips(
 
 
 def few(clips: Mapping[str, object], like: str = "") -> str:
-    """The names of clips for a message: all, or a few of many, those most like a name first."""
+    """The names of clips for a message: all, or a few of many, the most similar to a name first."""
     import difflib
 
     if len(clips) <= LISTED:
@@ -178,13 +178,13 @@ def few(clips: Mapping[str, object], like: str = "") -> str:
 
 
 def shortest(motions: Mapping[str, Tensor]) -> tuple[int, str | None]:
-    """Number of frames that all motions have, and a note on what that cuts; None if they are of one length."""
+    """The frames common to all motions, and a note on cut frames; None if all have one length."""
     lengths = {name: len(motion) for name, motion in motions.items()}
     frames = min(lengths.values())
     if len(set(lengths.values())) == 1:
         return frames, None
-    listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-    return frames, f"lengths differ ({listed} frames): cut to the first {frames}"
+    sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())
+    return frames, f"lengths differ ({sizes} frames): cut to the first {frames}"
 
 
 def chunks(motion: Tensor, path: Path, frames: int) -> Iterator[Array]:
@@ -222,25 +222,26 @@ class Painter:
             limits = zip(points.min(0) - (more, more, 0), points.max(0) + (more, more, 0), strict=True)
             corners = np.stack(np.meshgrid(*limits), -1).reshape(-1, 3)
             framed = np.concatenate([points, corners])
-        whole, camera = Camera.framing(shape, view=view), Camera.framing(framed, view=view)
-        # A close-up must not cut off the ears, which are behind what the camera is framed on.
-        self._camera = replace(camera, radius=max(camera.radius, whole.radius))
+        face, camera = Camera.framing(shape, view=view), Camera.framing(framed, view=view)
+        # A close-up must not cut off the ears, which are behind the framed region.
+        self._camera = replace(camera, radius=max(camera.radius, face.radius))
         points = self._camera.to_camera(framed)
-        seen = points[:, :2] / -points[:, 2:]
-        margin = 0.015 * np.ptp(seen, axis=0).max()  # for motion that leaves the template
-        # The camera's picture is wider than the face, since perspective makes far parts small: it is cut to what is
-        # seen. HALF is half the extent of the camera's picture at distance 1.
-        self._seen = np.clip(seen.min(0) - margin, -HALF, HALF), np.clip(seen.max(0) + margin, -HALF, HALF)
+        projected = points[:, :2] / -points[:, 2:]
+        margin = 0.015 * np.ptp(projected, axis=0).max()  # for motion that leaves the template
+        # The camera's picture is wider than the face, since perspective makes far parts small: it is cut to the face.
+        # HALF is half the extent of the camera's picture at distance 1.
+        low, high = projected.min(0) - margin, projected.max(0) + margin
+        self._extent = np.clip(low, -HALF, HALF), np.clip(high, -HALF, HALF)
 
     @property
     def aspect(self) -> float:
         """Width of a picture by its height."""
-        low, high = self._seen
+        low, high = self._extent
         return float((high[0] - low[0]) / (high[1] - low[1]))
 
     def set_size(self, width: int, height: int) -> None:
         """Choose how many pixels a picture has."""
-        low, high = self._seen
+        low, high = self._extent
         scale = height / (high[1] - low[1])
         size = math.ceil(2 * HALF * scale)
         left, top = round((HALF + low[0]) * scale), round((HALF - high[1]) * scale)

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SUFFIXES = (".png", ".pdf", ".svg")
+DATES: dict[str, dict[str, Any]] = {
+    ".png": {"Software": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+    ".svg": {"Date": None, "Creator": None},
+}
+"""Formats by suffix, with the metadata that would differ between equal figures."""
 COLUMN, PAGE = 85.0, 175.0  # Widths in mm of a column and of a page of the usual journals
 POINTS_PER_MM = 72 / 25.4
 
@@ -51,8 +56,8 @@ class Paper:
 
 def check_output(path: Path) -> None:
     """Check, before any work is done, that a figure can be written to a file."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise FaceDiffError(f'--output {path}: unknown suffix "{path.suffix}"; expected one of {", ".join(SUFFIXES)}')
+    if path.suffix.lower() not in DATES:
+        raise FaceDiffError(f'--output {path}: unknown suffix "{path.suffix}"; expected one of {", ".join(DATES)}')
     check_writable(path)
 
 
@@ -88,15 +93,10 @@ def save(figure: Figure, path: Path) -> None:
     Call it inside :func:`style`.
     """
     check_output(path)
-    dates: dict[str, dict[str, Any]] = {
-        ".png": {"Software": None},
-        ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-        ".svg": {"Date": None, "Creator": None},
-    }
     suffix = path.suffix.lower()
     with atomic(path) as temporary:
         content = io.BytesIO()  # on a full disk, matplotlib's writers fail with errors that do not say so
-        figure.savefig(content, format=suffix[1:], dpi="figure", metadata=dates[suffix])
+        figure.savefig(content, format=suffix[1:], dpi="figure", metadata=DATES[suffix])
         temporary.write_bytes(content.getbuffer())
 
 
@@ -180,8 +180,8 @@ class Grid:
             self.names = [wrapped(name, height, TEXT, paper.font) for name in rows]
             lines = min(max(map(len, self.names)), NAME_LINES) if any(rows) else 0
         self.width, self.height = aspect * height, height
-        used = names + len(columns) * self.width + (len(columns) - 1) * GAP + right
-        self.left = (paper.width - used) / 2 + names
+        extent = names + len(columns) * self.width + (len(columns) - 1) * GAP + right
+        self.left = (paper.width - extent) / 2 + names
         self.headings = [wrapped(heading.large, self.width, TEXT, paper.font) for heading in columns]
         self.header = max(len(text) * line * any(text) for text in self.headings)
         self.header += line_height(SMALLEST_TEXT) * any(heading.small for heading in columns)
@@ -209,8 +209,8 @@ class Grid:
         line, small_line = line_height(TEXT), line_height(SMALLEST_TEXT)
         for row, lines in enumerate(self.names):
             middle = self.place(row, 0)[1] + self.height / 2
-            shown = lines if len(lines) <= NAME_LINES else [*lines[: NAME_LINES - 1], lines[NAME_LINES - 1][:-1] + "…"]
-            for number, text in enumerate(reversed(shown)):
+            name = lines if len(lines) <= NAME_LINES else [*lines[: NAME_LINES - 1], lines[NAME_LINES - 1][:-1] + "…"]
+            for number, text in enumerate(reversed(name)):
                 self._text(text, self.left - GAP - (number + 0.5) * line, middle, rotation=90)
         small = small_line * any(heading.small for heading in self.columns)
         for column, heading in enumerate(self.columns):

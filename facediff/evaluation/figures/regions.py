@@ -40,7 +40,7 @@ def draw_regions(
     Args:
         root: the corpus folder; its mesh and region files are needed, no clips.
         output: the picture (.png).
-        corpus: what the folder is: a corpus's name, or the import path of its data module; recognised if None.
+        corpus: a corpus's name, or the import path of its data module; recognised if None.
         lips: source of the lips; the corpus's own if None.
         upper_face: source of the upper face; the corpus's own if None.
         size: height of each view in pixels.
@@ -55,8 +55,8 @@ def draw_regions(
         advice = f"put {names} into this folder" if names else "give a corpus folder of the same topology"
         raise FaceDiffError(f"{root}: no mesh to draw the regions on; {advice}")
     regions, lines = {}, {}
-    for part, own in (("lips", lips), ("upper_face", upper_face)):
-        sources = view.region_sources.get(part, ()) if own is None else (own,)
+    for part, source in (("lips", lips), ("upper_face", upper_face)):
+        sources = view.region_sources.get(part, ()) if source is None else (source,)
         regions[part] = find_region(root, sources, part, view.n_vertices, view.region_help)
         lines[part] = legend(root, sources, regions[part])
     save_image(output, draw(mesh, regions, lines, f"{view.corpus}, {view.n_vertices} vertices", size))
@@ -64,7 +64,7 @@ def draw_regions(
 
 
 def find_view(root: Path, corpus: str | None) -> CorpusView:
-    """What a folder is, as ``facediff data check`` recognises it."""
+    """The corpus of a folder, as ``facediff data check`` recognises it."""
     findings = Findings()
     manifest = manifest_in(root, MANIFEST, findings)
     view = identify(list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, manifest, findings)
@@ -75,9 +75,9 @@ def find_view(root: Path, corpus: str | None) -> CorpusView:
 
 def legend(root: Path, sources: Sequence[str], region: Region) -> str:
     """A region in one line: name, vertex count, hash, source, and how many indices its source repeats."""
-    used = next((source for source in sources if (root / source.partition(":")[0]).is_file()), sources[0])
+    file = next((source for source in sources if (root / source.partition(":")[0]).is_file()), sources[0])
     repeated = f", {region.duplicates} repeated indices counted once" if region.duplicates else ""
-    return f"{region} from {used}{repeated}"
+    return f"{region} from {file}{repeated}"
 
 
 def draw(mesh: Mesh, regions: dict[str, Region], lines: dict[str, str], title: str, size: int) -> npt.NDArray[np.uint8]:

@@ -55,18 +55,18 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
 
     Args:
         path: ``metrics.csv``.
-        axis: what the scalars are given over.
+        axis: of the scalars.
     """
     # The inner dictionaries are by step or epoch: a run that was resumed may repeat steps, and the later one counts.
     columns: dict[str, dict[float, float]] = {}
     try:
-        place: str | None = None
+        x: str | None = None
         for row in read_rows(path, remedy="expected what CSVLogger writes during training"):
             # Rows of the learning rate have no epoch: they belong to the epoch of the row before.
-            place = row.get(axis) or (place if axis == "epoch" else None)
+            x = row.get(axis) or (x if axis == "epoch" else None)
             for name, text in row.items():
-                if name not in ("step", "epoch", "") and text and place and np.isfinite(float(place)):
-                    columns.setdefault(name, {})[float(place)] = float(text)
+                if name not in ("step", "epoch", "") and text and x and np.isfinite(float(x)):
+                    columns.setdefault(name, {})[float(x)] = float(text)
     except ValueError:
         columns = {}
     if not columns:
@@ -76,9 +76,9 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
 
 
 def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str] | None) -> list[str]:
-    """Scalars to draw: those asked for, else the loss of training and the LVE of validation if they were logged."""
-    usual = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
-    scalars = scalars or usual or USUAL_SCALARS
+    """Scalars to draw: the given ones, else the loss of training and the LVE of validation if they were logged."""
+    defaults = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
+    scalars = scalars or defaults or USUAL_SCALARS
     for run, curves in runs.items():
         for name in scalars:
             if name not in curves:
@@ -110,10 +110,10 @@ def smooth(values: Array, weight: float) -> Array:
     """
     smoothed = np.array(values, np.float64)
     total = weights = 0.0
-    for place, value in enumerate(values):
+    for index, value in enumerate(values):
         if math.isfinite(value):
             total, weights = weight * total + (1 - weight) * value, weight * weights + (1 - weight)
-            smoothed[place] = total / weights
+            smoothed[index] = total / weights
     return smoothed
 
 
@@ -135,7 +135,7 @@ def draw_training(
         scalars: scalars to draw.
         output: ``.png``, ``.pdf`` or ``.svg``.
         paper: width, resolution and font.
-        axis: what the curves are over.
+        axis: horizontal axis.
         smoothing: weight of the past in the moving average, from 0 (none) to below 1; the values themselves stay
             visible behind it.
         log: whether the values' axis is logarithmic.

@@ -204,16 +204,6 @@ def test_fonts(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_options_of_curves_that_cannot_be(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    with pytest.raises(FaceDiffError, match="smoothing"):
-        draw_training(RUNS, ["val/lve"], path, smoothing=1.0)
-    for span in ((1.0, 0.5), (3.0, 4.0)):
-        with pytest.raises(FaceDiffError, match="span"):
-            draw_lips(LIPS, SpeechTrack(), path, span=span)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_lips_are_drawn_at_their_times_and_in_their_unit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     saved: list[Figure] = []
     monkeypatch.setattr(lips_module, "save", lambda figure, path: saved.append(figure))

@@ -70,12 +70,6 @@ def test_a_phoneme_is_found_at_its_middle(tmp_path: Path) -> None:
     assert Moment(0.15, replace(phonemes[1], word="map")).heading.large == "/m/ map"
 
 
-@pytest.mark.parametrize("time", [9.0, -0.1, float("nan"), float("inf")])
-def test_times_outside_a_motion(own_material: FigureData, time: float) -> None:
-    with pytest.raises(FaceDiffError, match=r"has no frame at .* s; truth lasts from 0 to 0\.96 s \(24 frames at 25 a"):
-        pick_frames(own_material, "A_e06", [Moment(time)])
-
-
 CSV = "epoch,lr,step,train/loss,val/lve\n,0.1,0,,\n0,,0,4.0,\n0,,9,2.0,\n0,,9,,0.5\n1,,19,nan,\n1,,19,,0.25\n"
 
 
@@ -95,19 +89,6 @@ def test_curves_of_a_run(tmp_path: Path) -> None:
         choose_scalars(runs, ["val/lvee"])
     with pytest.raises(FaceDiffError, match="choose with --scalar: known are lr"):
         choose_scalars({"one": {"lr": curves["lr"]}}, None)
-
-
-def test_runs_without_metrics(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r"metrics\.csv: no such file; expected a run folder"):
-        find_metrics(tmp_path)
-    (tmp_path / "version_3").mkdir()
-    (tmp_path / "version_3" / "metrics.csv").write_text("epoch,step,a\n0,0,x\n")
-    with pytest.raises(FaceDiffError, match=r"runs below are .*version_3"):
-        find_metrics(tmp_path)
-    for text in ("epoch,step,a\n0,0,x\n", "epoch,step\n0,0\n"):
-        (tmp_path / "version_3" / "metrics.csv").write_text(text)
-        with pytest.raises(FaceDiffError, match="holds no numbers over steps"):
-            read_curves(find_metrics(tmp_path / "version_3"))
 
 
 def test_smoothing_is_the_weighted_mean_of_the_past() -> None:

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import (
     FigureData,
-    Moment,
     error_maps,
     find_clips,
     motion_maps,
     opening_curves,
-    pick_frames,
     read_pairs,
 )
 from facediff.evaluation.figures.gather import gather
@@ -48,19 +46,6 @@ def test_a_stride_of_the_truth(own_material: FigureData, read: Read) -> None:
     np.testing.assert_array_equal(opened["truth"].numpy(), read("truth", "A_e06")[::2].astype("f4"))
 
 
-def test_unusable_files_are_named(damaged: Callable[..., FigureData], read: Read) -> None:
-    whole = read("ours", "A_e06")
-    for part in (whole[:0], whole[:, :20]):
-        with pytest.raises(FaceDiffError, match="A_e06"):
-            damaged(part).open("A_e06")
-    whole[2, 3, 1] = np.nan
-    material = damaged(whole)
-    for compute in (error_maps, motion_maps):
-        with pytest.raises(FaceDiffError, match=r"A_e06_condition_A\.npy: holds NaN"):
-            compute(material, ["A_e06"])
-    assert pick_frames(material, "A_e06", [Moment(0.13)])  # other frames can be shown
-
-
 def test_choosing_clips(own_material: FigureData, tiny_root: Path, methods: dict[str, Path], tmp_path: Path) -> None:
     assert own_material.choose(["B_e06", "B_e06"]) == ["B_e06"]
     with pytest.raises(FaceDiffError, match=r'no clip "A_e66".*did you mean "A_e06"'):
@@ -75,18 +60,6 @@ def test_choosing_clips(own_material: FigureData, tiny_root: Path, methods: dict
     parted = {name: {clip: Path()} for name, clip in zip(("ours", "theirs"), CLIPS, strict=False)}
     with pytest.raises(FaceDiffError, match="truth and ours and theirs have no clip in common"):
         replace(own_material, methods=parted).choose()
-
-
-def test_unknown_facts_name_the_option_that_gives_them(own_material: FigureData) -> None:
-    with pytest.raises(FaceDiffError, match="--mesh"):
-        replace(own_material, faces=None).mesh(["A_e06"])
-    with pytest.raises(FaceDiffError, match="--frame-rate"):
-        pick_frames(replace(own_material, frame_rate=None), "A_e06", [Moment(0.1)])
-    with pytest.raises(FaceDiffError, match="--templates"):
-        motion_maps(replace(own_material, templates={}), ["A_e06"])
-    np.testing.assert_array_equal(replace(own_material, templates={}).mesh(["A_e06"])[1], own_material.rest)
-    assert own_material.scale == (1000.0, "mm")
-    assert replace(own_material, unit="normalised (a long story)").scale == (1.0, "normalised")
 
 
 def test_the_built_in_corpus_is_known_with_its_unit(tmp_path: Path) -> None:
