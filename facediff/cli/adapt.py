@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
     from facediff.models.audio_distillation import DistillationOptions
 
-CLIP_SECONDS = 0.05  # What training on a clip takes with the built-in corpus's small model, on two processor cores
-OF_TRAINING = (
+CLIP_SECONDS = 0.05  # Training time of a clip with the built-in corpus's small model, on two processor cores
+TRAINING_STATE = (
     *("optimizer_states", "lr_schedulers", "loops", "callbacks"),
     *("facediff_training_state", "current_model_state", "averaging_state"),
 )
-"""What a checkpoint holds for a training that goes on."""
+"""Entries of a checkpoint from which its training would continue."""
 
 Mode = Literal["finetune", "joint"]
 
@@ -169,23 +169,7 @@ def train_on(
     *,
     quiet: bool,
 ) -> str:
-    """Write a checkpoint that knows a new person or face; see :func:`adapt`.
-
-    Args:
-        checkpoint: the trained model.
-        output: checkpoint to write.
-        person: folder or name of the speaker; None for a face.
-        face: corpus of the face; None for a person.
-        where: folder and class of the corpus, if they are given.
-        options: how it is trained.
-        licence: which models are refused.
-        accelerator: Lightning's.
-        seed: of all random numbers.
-        quiet: no progress bar.
-
-    Returns:
-        what was done, in which ``{seconds}`` is left to be filled in.
-    """
+    """Write a checkpoint that knows a new person or face; the report has ``{seconds}`` to fill in."""
     from lightning.pytorch import Trainer, seed_everything
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
@@ -208,12 +192,13 @@ def train_on(
     if licence.commercial_only:
         require_cleared(checkpoint, model.licences)
     prepared(data)
-    if name not in data.corpus.templates:
-        speakers = ", ".join(sorted(data.corpus.templates))
-        raise FaceDiffError(f"--person {person}: neither a person's folder nor a speaker of the corpus ({speakers})")
     clips = data.clips("train")
     if person is not None and not any(clip.identity == name for clip in clips):
-        raise FaceDiffError(f"--person {person}: no clip of {name} lies outside the corpus's test split")
+        speakers = ", ".join(sorted(data.corpus.templates))
+        raise FaceDiffError(
+            f"--person {person}: neither a person's folder nor a speaker with clips outside the test splits; the "
+            f"corpus has {speakers}"
+        )
     confirm_cost(options.yes, "--epochs", seconds=CLIP_SECONDS * options.epochs * len(clips))
     seed_everything(seed, verbose=False)
     model = with_extra_identities(model, list(data.identities)) if face is None else with_new_face(model, data)
@@ -288,20 +273,9 @@ def write_distilled(
     device: str = "cpu",
     quiet: bool = False,
 ) -> float:
-    """Write a checkpoint's content with a distilled audio encoder, and everything else as it is.
+    """Write a checkpoint's content with a distilled audio encoder; the remaining error of its features.
 
-    Args:
-        checkpoint: the file.
-        content: of it; it is changed.
-        data: the corpus.
-        output: checkpoint to write.
-        options: how the encoder is distilled.
-        encoder: an encoder that replaces the checkpoint's, by name with its options; None for itself.
-        device: where.
-        quiet: no progress bar.
-
-    Returns:
-        the remaining error, as :func:`facediff.models.audio_distillation.distil_audio_encoder` gives it.
+    ``encoder`` replaces the checkpoint's: a name with options.
     """
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
     from facediff.models.adaptation import with_audio_encoder
@@ -314,12 +288,12 @@ def write_distilled(
         from facediff.registry import audio_encoder as registered
 
         name, init_args = registered.read(encoder)
-        chosen = {"class_path": f"facediff.registry.audio_encoder.{name}", "init_args": init_args}
+        component = {"class_path": f"facediff.registry.audio_encoder.{name}", "init_args": init_args}
         teacher, replaced = model.speech_encoder, set(encoder_weights(model))
-        model = with_audio_encoder(model, chosen).to(device)
-        content["hyper_parameters"] = {**content["hyper_parameters"], "audio_encoder": chosen}
+        model = with_audio_encoder(model, component).to(device)
+        content["hyper_parameters"] = {**content["hyper_parameters"], "audio_encoder": component}
         content["state_dict"] = {key: weight for key, weight in content["state_dict"].items() if key not in replaced}
-        for key in OF_TRAINING:  # it belongs to the encoder that was replaced; `fit` starts from the beginning
+        for key in TRAINING_STATE:  # it belongs to the replaced encoder; `fit` starts from the beginning
             content.pop(key, None)
     with progress_bar(options.goal, options.steps, shown=not quiet) as step:
         error = distil_audio_encoder(model, data, options, step, teacher=teacher)
@@ -333,7 +307,7 @@ def write_distilled(
 
 
 def corpus_of_face(face: str, root: Path | None) -> SpeechMotionDataModule:
-    """The data module of ``--face``, with its usual options."""
+    """The data module of ``--face``, with default options."""
     from facediff.cli.data import find_own_module
     from facediff.data.check.layouts import by_name
 

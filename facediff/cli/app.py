@@ -137,18 +137,19 @@ GROUPS = {
 
 
 def installed_commands() -> dict[str, EntryPoint]:
-    """The commands that installed packages add, by name; those that are facediff's cannot be replaced."""
+    """The commands that installed packages add, by name; they cannot replace facediff's."""
     from importlib.metadata import entry_points
 
-    taken = {name.partition(" ")[0] for name in COMMANDS}
-    return {point.name: point for point in entry_points(group="facediff.command") if point.name not in taken}
+    built_in = {name.partition(" ")[0] for name in COMMANDS}
+    return {point.name: point for point in entry_points(group="facediff.command") if point.name not in built_in}
 
 
 def usage(group: str = "") -> str:
     """The help text of the program or of a group of commands."""
     if group:
-        own = {name: command for name, command in COMMANDS.items() if name.startswith(f"{group} ")}
-        rows = {name.partition(" ")[2]: command.help for name, command in own.items()}
+        rows = {
+            name.partition(" ")[2]: command.help for name, command in COMMANDS.items() if name.startswith(f"{group} ")
+        }
     else:
         rows = {name: command.help for name, command in COMMANDS.items() if name.partition(" ")[0] not in GROUPS}
         rows |= GROUPS
@@ -176,30 +177,27 @@ def usage(group: str = "") -> str:
 
 def find(arguments: Sequence[str]) -> tuple[str, list[str]]:
     """The command's name, which may have two words, and the rest."""
-    first, rest = arguments[0], list(arguments[1:])
+    first, *rest = arguments
     if rest and f"{first} {rest[0]}" in COMMANDS:
         return f"{first} {rest[0]}", rest[1:]
     if first in COMMANDS:
         return first, rest
-    if first not in GROUPS:
+    if first in GROUPS:
+        word, name = rest[0], f"{first} {rest[0]}"
+        commands = [command.partition(" ")[2] for command in COMMANDS if command.startswith(f"{first} ")]
+    else:
         installed = installed_commands()
         if first in installed:
             return first, rest
-        commands = [*dict.fromkeys(name.partition(" ")[0] for name in COMMANDS), *installed]
-        raise FaceDiffError(f'there is no command "{first}": {choices(first, commands)}')
-    # A group with a command of it is found above.
-    members = [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{first} ")]
-    raise FaceDiffError(f'there is no command "{first} {rest[0]}": {choices(rest[0], members)}')
+        word = name = first
+        commands = [*dict.fromkeys(command.partition(" ")[0] for command in COMMANDS), *installed]
+    raise FaceDiffError(f'there is no command "{name}": {choices(word, commands)}')
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line; the exit status, as docs/command_line.md lists them.
 
-    Args:
-        args: the words after ``facediff``; those of the process if None, whose streams and signals are then set up.
-
-    Returns:
-        the exit status: 0 for success, 2 for something the user can put right; all are in docs/command_line.md.
+    ``args`` are the words after ``facediff``; if None, those of the process, whose streams and signals are set up.
     """
     if args is not None:
         return answer(args)
@@ -211,7 +209,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def answer(arguments: Sequence[str]) -> int:
-    """Run a command, and report in one sentence what goes wrong; the exit status."""
+    """Run a command, and report an error in one sentence; the exit status."""
     name = arguments[0] if arguments else ""
     try:
         try:
@@ -267,7 +265,7 @@ def load(name: str) -> Callable[..., int | None]:
         point = installed_commands()[name]
         try:
             installed: Callable[..., int | None] = point.load()
-        except Exception as error:  # whatever somebody else's module raises
+        except Exception as error:  # another package's module may raise anything
             raise FaceDiffError(
                 f"the command {name} ({point.value}) cannot be imported: {import_failure(error)}"
             ) from error

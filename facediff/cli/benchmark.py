@@ -127,8 +127,6 @@ def report(
     from facediff.benchmark.outline import read_outline
     from facediff.benchmark.plan import MEAN_SUFFIX
 
-    if page is not None and not page.is_file():
-        raise FaceDiffError(f"--page {page}: no such file; expected a Markdown page with marked blocks")
     for folder in folders:
         rows = read_outline(folder).rows
         if baseline is not None and baseline.removesuffix(MEAN_SUFFIX) not in rows:
@@ -146,11 +144,9 @@ def corpus_folders(arguments: Sequence[str]) -> dict[str, Path]:
     """Folders of corpora, from words CORPUS=FOLDER."""
     folders: dict[str, Path] = {}
     for word in arguments:
-        name, equals, folder = word.partition("=")
-        if not equals or not name or not folder:
-            raise FaceDiffError(f"--root {word}: expected CORPUS=FOLDER, such as biwi=BIWI")
-        if name in folders:
-            raise FaceDiffError(f"--root {word}: the corpus {name} has a folder already; give one")
+        name, _, folder = word.partition("=")
+        if not name or not folder or name in folders:
+            raise FaceDiffError(f"--root {word}: expected CORPUS=FOLDER, such as biwi=BIWI, once for each corpus")
         folders[name] = Path(folder)
     return folders
 
@@ -172,13 +168,13 @@ def announce(
     rows = [[str(cell), cell.kind, None if seconds[cell] is None else f"{seconds[cell]:.0f} s"] for cell in left]
     tell(*format_table(["to run", "", "last time"], rows, left=2).split("\n"))
     timed = [value for value in seconds.values() if value is not None]
-    missing = len(left) - len(timed)
+    untimed = len(left) - len(timed)
     if timed:
         # With one worker the times add up; several share them, and the longest cell is the least that it takes.
         total = max(sum(timed) / (workers or 1), max(timed))
-        unknown = f", and {counted(missing, 'cell')} without a timing" if missing else ""
-        one = "" if workers else " on one worker"
-        tell(f"about {total / 60:.0f} minutes{one} by the last timings{unknown}")
+        unknown = f", and {counted(untimed, 'cell')} without a timing" if untimed else ""
+        worker = "" if workers else " on one worker"
+        tell(f"about {total / 60:.0f} minutes{worker} by the last timings{unknown}")
     else:
         tell("no cell of these was ever timed here")
 
@@ -192,25 +188,25 @@ def write_and_tell(
     from facediff.benchmark.writing import text, write_report
 
     outline = read_outline(folder)
-    results, missing = read_results(folder, outline)
-    report = report_of(outline, results, missing, baseline=baseline, resamples=resamples, level=level, seed=seed)
+    results, pending_cells = read_results(folder, outline)
+    report = report_of(outline, results, pending_cells, baseline=baseline, resamples=resamples, level=level, seed=seed)
     files = write_report(report, output or folder / "report")
     tell(*text(report).split("\n"), *(f"written: {path}" for path in files))
     return report
 
 
-# What can be found out before anything runs.
+# Checks before anything runs.
 
 
 def check_cells(
     plan: BenchmarkPlan, cells: Sequence[Cell], left: Sequence[Cell], folder: Path, *, dry_run: bool
 ) -> Setting:
-    """Parse every command that will be run, find every corpus, and make the built-in one; what all cells share."""
+    """Parse every command to be run, find every corpus, and make the built-in one; the setting of all cells."""
     from facediff.benchmark.running import Setting, fit_options, option_words
     from facediff.cli.lightning import parse_fit
 
     setting = Setting(folder, plan.protocol, plan.metrics, plan.weights, plan.threads)
-    seen: set[str] = set()
+    parsed: set[str] = set()
     prepared: dict[str, SpeechMotionDataModule] = {}
     clips: dict[str, dict[str, str]] = {}
     truths: dict[str, tuple[str, ...]] = {}
@@ -227,9 +223,9 @@ def check_cells(
             }
             command_line = ["--config", str(training.config), *option_words({**options, "seed_everything": 0})]
             mark = " ".join(command_line)
-            if mark in seen:
+            if mark in parsed:
                 continue
-            seen.add(mark)
+            parsed.add(mark)
             with naming(plan, cell):
                 model_class, class_path, arguments = parse_fit(command_line)
                 if not model_class.startswith("facediff."):
@@ -272,26 +268,19 @@ def naming(plan: BenchmarkPlan, cell: Cell) -> Iterator[None]:
 def check_checkpoint(
     cell: Cell, kind: type[SpeechMotionDataModule] | None, class_path: str | None, root: str | None
 ) -> None:
-    """Refuse a checkpoint that is of another corpus than the plan's, or whose corpus is not here.
-
-    Args:
-        cell: of a checkpoint.
-        kind: data module of the plan's corpus, where the plan says it.
-        class_path: its name, if it is no part of facediff.
-        root: folder of the corpus that the plan's data config names.
-    """
+    """Refuse a checkpoint of another corpus than the plan's, or without its corpus on this machine."""
     from facediff.cli.lightning import corpus_and_folder
     from facediff.models.checkpoint import read_checkpoint
 
     path = Path(str(cell.source))
-    chosen = cell.test_options.get("data") or class_path
+    module_name = cell.test_options.get("data") or class_path
     folder = cell.root or (None if root is None else Path(root))
-    corpus = None if chosen is None else str(chosen)
+    corpus = None if module_name is None else str(module_name)
     module, options = corpus_and_folder(path, read_checkpoint(path), corpus, folder)
     if kind is not None and module.corpus_name != kind.corpus_name:
         raise FaceDiffError(
-            f"{path}: is of the corpus {module.corpus_name}, and the plan's is {kind.corpus_name}; name with the "
-            f"method's key `corpora` those that it is of"
+            f"{path}: is a model of {module.corpus_name}, and the plan's corpus is {kind.corpus_name}; list the "
+            f"model's corpora under the method's key `corpora`"
         )
     require_folder(module, options.get("root"))
 
@@ -319,8 +308,8 @@ def data_class(class_path: str) -> type[SpeechMotionDataModule]:
 
     if "." in class_path and not class_path.startswith("facediff."):
         find_own_module(class_path)
-    own = class_path.startswith("facediff.data.")
-    return by_name(class_path.rpartition(".")[2] if own else class_path, None, "class_path")
+    name = class_path.rpartition(".")[2] if class_path.startswith("facediff.data.") else class_path
+    return by_name(name, None, "class_path")
 
 
 def data_of(

@@ -76,7 +76,7 @@ def blendshapes(
 ) -> None:
     """Solve for the weights of blendshapes (ARKit's 52 names) that come nearest to an animation.
 
-    They are written as the table that Live Link Face records; what the table cannot say is in a .json next to it.
+    They are written as the table that Live Link Face records, with a .json next to it for everything else.
 
     Args:
         animation: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
@@ -84,9 +84,9 @@ def blendshapes(
         shapes: folder of .obj or .ply files named jawOpen, mouthFunnel … with the face at rest as neutral, or a .glb
             with named targets, or "puppet" for those of the built-in face
         write_puppet_shapes: write shapes of the built-in puppet's face (of the speaker --identity) and do nothing else
-        weights: how they are found.
+        weights: how they are solved for.
         table: how they are written.
-        source: what completes a bare .npy.
+        source: mesh, frame rate and unit of a bare .npy.
     """
     if write_puppet_shapes is not None:
         idle = {**changed(weights), **changed(table), **changed(source), "identity": False}
@@ -116,22 +116,22 @@ def blendshapes(
     if table.show is not None:
         _ = motion.triangles  # refuses an animation without triangles before anything is written
     plain = table.plain or table.tracks != "arkit"
-    # Shapes without a column would take motion that the table then lacks, such as mouthOpen that of jawOpen.
+    # Shapes without a column would take motion that the table then lacks: mouthOpen would take jawOpen's.
     only_arkit = weights.only_arkit or not table.plain
-    found, solved = solve_weights(motion, shapes, options, carry=weights.carry, only_arkit=only_arkit)
+    shape_set, solved = solve_weights(motion, shapes, options, carry=weights.carry, only_arkit=only_arkit)
     rows = solved if table.csv_rate is None else solved.at_rate(table.csv_rate)
     rows = rows if table.tracks == "arkit" else rows.tracks(table.tracks)
     rows.save(output, plain=plain, key_tolerance=table.key_tolerance)
     if table.show is not None:
         from facediff.export.pictures import draw_worst_frame
 
-        draw_worst_frame(table.show, motion, found, solved)
+        draw_worst_frame(table.show, motion, shape_set, solved)
     tell(f"{output}: {counted(len(solved.values), 'frame')}, {counted(len(solved.names), 'shape')}")
-    tell(*found.notes, *remarks(solved, plain=plain))
+    tell(*shape_set.notes, *remarks(solved, plain=plain))
 
 
 def remarks(weights: Weights, *, plain: bool) -> list[str]:
-    """What a user should know of the weights, a sentence each."""
+    """Residual, convergence and absent shapes, a sentence each."""
     import numpy as np
 
     share, rms = weights.residual_share, weights.residual_rms_mm

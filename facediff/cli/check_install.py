@@ -1,4 +1,4 @@
-"""``facediff check-install``: what is installed here, what of it works, and what is missing for what."""
+"""``facediff check-install``: versions, devices and extras, and a trial of the bundled model."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from facediff.errors import FaceDiffError, printable, shortened
 if TYPE_CHECKING:
     from facediff.animation import Animation
 
-SHOWN = ("numpy", "onnxruntime", "torch", "torchmetrics", "lightning", "transformers", "scipy", "trimesh")
-"""Packages whose versions a report of a mistake needs."""
+PACKAGES = ("numpy", "onnxruntime", "torch", "torchmetrics", "lightning", "transformers", "scipy", "trimesh")
+"""Packages whose versions a bug report needs."""
 GROUPS = ("all", "dev", "docs", "test", "cli", "audio", "runtime")
 """Extras that are sums of others, of development, or a part of every installation."""
 SECONDS = 10
@@ -28,15 +28,15 @@ REQUIREMENT = re.compile(r"\s*([A-Za-z0-9._-]+)\s*(?:\[([^]]*)\])?[^;]*(?:;.*ext
 
 
 def check_install() -> None:
-    """Print versions, devices and extras, animate ten seconds with the bundled model, and say what is wrong.
+    """Print versions, devices and extras, and animate ten seconds with the bundled model.
 
-    Paste what it prints into the report of a mistake. The exit status is 2 where the base installation does not work.
+    Paste its output into a bug report. The exit status is 2 where the base installation does not work.
     """
     from facediff.version import __version__
 
     tell(f"facediff {__version__} in {os.path.dirname(os.path.dirname(os.path.abspath(__file__)))}")
     tell(f"Python {platform.python_version()} ({sys.executable}) on {platform.platform()}")
-    versions = {name: version for name in SHOWN if (version := version_of(name))}
+    versions = {name: version for name in PACKAGES if (version := version_of(name))}
     tell("packages: " + ", ".join(f"{name} {version}" for name, version in versions.items()))
     tell(f"devices: {devices('torch' in versions)}")
     lacking = {extra: list(missing(extra)) for extra in sorted(extras())}
@@ -47,9 +47,7 @@ def check_install() -> None:
     started = time.monotonic()
     try:
         animation = trial()
-    except FaceDiffError:
-        raise
-    except Exception as error:  # whatever is wrong here is what is asked for
+    except Exception as error:  # a damaged installation may raise anything
         reason = shortened(printable(f"{type(error).__name__}: {error}"))
         raise FaceDiffError(
             f"the bundled model does not animate ({reason}); install facediff again in a new virtual environment"
@@ -75,10 +73,7 @@ def trial() -> Animation:
     model = facediff.load(BUNDLED)
     animation: Animation = model.animate(speech, SAMPLE_RATE)
     if len(animation.vertices) != round(SECONDS * animation.frame_rate) or not np.isfinite(animation.vertices).all():
-        raise FaceDiffError(
-            f"the bundled model gives {animation.vertices.shape} for {SECONDS} s at {animation.frame_rate:g} frames a "
-            f"second; the installation is damaged, install facediff again"
-        )
+        raise FaceDiffError(f"{animation.vertices.shape} for {SECONDS} s at {animation.frame_rate:g} frames a second")
     return animation
 
 

@@ -1,4 +1,4 @@
-"""``facediff components``: what can be chosen by name."""
+"""``facediff components``: the list of everything that can be chosen by name."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
 
     if kind is not None and kind not in KINDS:
         raise FaceDiffError(f'there is no kind "{kind}": {choices(kind, KINDS)}')
-    chosen = [entry_kind for entry_kind in KINDS.values() if kind in (None, entry_kind.kind)]
+    kinds = [entry_kind for entry_kind in KINDS.values() if kind in (None, entry_kind.kind)]
     bundled = bundled_models() if kind in (None, "model") else []
     if json:
         rows = [
             {"kind": entry_kind.kind, "name": entry.name, "summary": entry.summary, "class": entry.owner}
-            for entry_kind in chosen
+            for entry_kind in kinds
             for entry in entry_kind
         ]
         tell(*json_format.dumps(rows + bundled, indent=2, allow_nan=False).split("\n"))
         return
-    width = max((len(entry.name) for entry_kind in chosen for entry in entry_kind), default=0) + 2
-    for entry_kind in chosen:
+    width = max((len(entry.name) for entry_kind in kinds for entry in entry_kind), default=0) + 2
+    for entry_kind in kinds:
         tell(f"{entry_kind.kind}: {entry_kind.title}")
         for entry in entry_kind:
             tell(f"  {entry.name:<{width}}{plain_text(entry.summary)}")

@@ -58,8 +58,8 @@ def class_of(path: Path | str) -> str | None:
     if isinstance(model, str) and (part := Path(path).parent / model).is_file():
         check_config(part)
         return class_of(part)
-    named = model.get("class_path") if isinstance(model, dict) else model
-    return named if isinstance(named, str) else None
+    path_of_class = model.get("class_path") if isinstance(model, dict) else model
+    return path_of_class if isinstance(path_of_class, str) else None
 
 
 PARTS = ("model", "data", "trainer")
@@ -70,13 +70,13 @@ def bundled_config(name: str) -> Path | None:
     """The file of a bundled config: of ``configs/trainer/cpu.yaml`` or, shorter, ``trainer/cpu``; None for others."""
     if not re.fullmatch(r"[\w./-]{1,200}", name):
         return None
-    place = config_dir() / name.removeprefix("configs/")
-    return next((path for path in (place, place.with_name(f"{place.name}.yaml")) if path.is_file()), None)
+    file = config_dir() / name.removeprefix("configs/")
+    return next((path for path in (file, file.with_name(f"{file.name}.yaml")) if path.is_file()), None)
 
 
-def as_parts(words: Sequence[str]) -> list[str]:
+def as_parts(arguments: Sequence[str]) -> list[str]:
     """The words with ``--trainer FILE`` in place of ``--config FILE`` where a bundled config holds that part alone."""
-    parts = list(words)
+    parts = list(arguments)
     for number, word in enumerate(parts):
         flag, joined, value = word.partition("=")
         if flag in ("-c", "--config"):

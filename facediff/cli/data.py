@@ -29,7 +29,7 @@ Root = Annotated[Path, Option(reads=True, exists="folder")]
 
 
 def require_folder(source: str) -> None:
-    """Refuse what is neither a folder nor an address, before anything heavy is imported."""
+    """Refuse a source that is neither a folder nor an address, before anything heavy is imported."""
     if "://" not in source and not Path(source).is_dir():
         raise FaceDiffError(f"{source}: no such folder; expected a corpus folder, or the address of a packed corpus")
 
@@ -38,7 +38,7 @@ Packed = Annotated[str, Option(reads=True, check=require_folder)]
 """A folder, or the address of a packed corpus, such as ``s3://bucket/corpus.zarr``."""
 NewFolder = Annotated[Path, Option(writes="folder")]
 
-SHOWN = 20
+LISTED = 20
 """Lines of a list on the screen; the whole list is in the manifest."""
 
 
@@ -74,8 +74,8 @@ def resumable(out: Path) -> Iterator[None]:
 
 
 def shortened(lines: Sequence[str], rest: str) -> list[str]:
-    """The first lines of a long list, and what is said of the rest, in which {} is the number of lines left out."""
-    return [*lines[:SHOWN], *([rest.format(len(lines) - SHOWN)] if len(lines) > SHOWN else [])]
+    """The first lines of a long list, and a line about the rest, in which {} is the number of lines left out."""
+    return [*lines[:LISTED], *([rest.format(len(lines) - LISTED)] if len(lines) > LISTED else [])]
 
 
 def check(
@@ -86,7 +86,7 @@ def check(
     json: bool = False,
     work: WorkOptions,
 ) -> int:
-    """Report which corpus a folder holds, what is missing and what is wrong in it.
+    """Report which corpus a folder holds, and its missing and damaged files.
 
     Nothing is changed. Exit status: 0 sound (warnings allowed), 1 not sound, 2 wrong usage.
 
@@ -97,9 +97,6 @@ def check(
         quick: read headers only, and compare files by size
         json: machine-readable: one object
         work: where the work is done
-
-    Returns:
-        0 if the folder is sound, 1 if not.
     """
     from facediff.data.check import check as check_folder
     from facediff.data.check import text
@@ -166,8 +163,8 @@ def options_of(plan: Callable[..., PreparationPlan]) -> Parameters:
             work: where the work is done
         """
 
-    own = {name: entry for name, entry in parameters_of(plan).items() if name not in ("raw", "quiet")}
-    return {**parameters_of(common), **own}
+    specific = {name: entry for name, entry in parameters_of(plan).items() if name not in ("raw", "quiet")}
+    return {**parameters_of(common), **specific}
 
 
 def describe(report: PreparationReport) -> list[str]:
@@ -179,8 +176,8 @@ def describe(report: PreparationReport) -> list[str]:
     ]
     for title, entries in (("missing", report.missing), ("failed", report.failed)):
         if entries:
-            listed = [f"  {line}" for line in grouped(entries)]
-            lines += [f"{title}: {len(entries)}", *shortened(listed, f"  … and {{}} more, see {manifest}")]
+            indented = [f"  {line}" for line in grouped(entries)]
+            lines += [f"{title}: {len(entries)}", *shortened(indented, f"  … and {{}} more, see {manifest}")]
     notes = [f"note: {note}" for note in report.notes]
     return [
         *lines,

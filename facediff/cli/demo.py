@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.options import OutputFolder
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -31,7 +30,7 @@ FAST = ("--data.drawn_speakers=0", "--trainer.max_epochs=8", "--model.warmup_ste
 def demo(
     *,
     output: OutputFolder = Path("demo"),
-    fast: bool = False,
+    fast: Annotated[bool, Option(without="epochs")] = False,
     epochs: Annotated[ranges.Epochs | None, Option(metavar="N")] = None,
     data_root: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
 ) -> None:
@@ -53,8 +52,6 @@ def demo(
     from facediff.cli.lightning import run_cli
     from facediff.export import ExportOptions, check_export
 
-    if fast and epochs is not None:
-        raise FaceDiffError("--fast and --epochs both say how long to train; give one of them")
     check_export(output / "truth_and_prediction.mp4", ExportOptions())
     from facediff.models.audio_distillation import DistillationOptions
     from facediff.models.checkpoint import read_checkpoint
@@ -169,9 +166,9 @@ def compare_with_bundled(checkpoint: Path, data: SpeechMotionDataModule) -> list
                 sample.template.expand_as(truth),
             ]
             errors.append([lip_vertex_error(motion, truth, lips).item() for motion in motions])
-        own, bundled, still = (sum(column) for column in zip(*errors, strict=True))
+        trained, bundled, still = (sum(column) for column in zip(*errors, strict=True))
         lines.append(
-            f"{split}, lip error of animate over a still face's: this model {own / still:.2f}, "
+            f"{split}, lip error of animate over a still face's: this model {trained / still:.2f}, "
             f"the one that comes with facediff {bundled / still:.2f}"
         )
     return lines

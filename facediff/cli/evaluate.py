@@ -1,4 +1,4 @@
-"""``facediff evaluate``: the scores of anybody's files, with what each number means and how certain it is."""
+"""``facediff evaluate``: scores of motion files by named protocols, with definitions and confidence intervals."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def evaluate(
         scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         quiet: no progress bar
         yes: start without a question, however long it takes
-        scores: what is computed.
+        scores: which scores are computed.
         files: how motion is stored.
     """
     methods = named_folders([predictions, *(method or [])])
@@ -183,7 +183,7 @@ def faces_of(
     scores: ScoreOptions,
     files: MotionOptions,
 ) -> dict[str, Any]:
-    """What scoring needs to know of the face: regions, pairs, templates, triangles; the corpus has the usual ones."""
+    """Regions, pairs, templates and triangles of the face; the corpus's where no option names them."""
     from facediff.data.corpus import read_templates
     from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN, read_region
     from facediff.evaluation.evaluator import find_protocols, needs_upper_face
@@ -219,7 +219,7 @@ def faces_of(
 
 
 def write(report: EvaluationReport, json: str | None, csv: Path | None) -> None:
-    """Print the table, or write and print what is asked for."""
+    """Print the table or the JSON, and write the files."""
     from facediff.evaluation import text
     from facediff.utils.files import atomic
     from facediff.utils.plain_files import json_text, write_rows

@@ -17,7 +17,7 @@ def format_table() -> str:
     """The formats, one a line."""
     from facediff.export import FORMATS
 
-    return "formats:\n" + "\n".join(f"  {suffix:<7}{made.help}" for suffix, made in FORMATS.items())
+    return "formats:\n" + "\n".join(f"  {suffix:<7}{form.help}" for suffix, form in FORMATS.items())
 
 
 @with_more_help(format_table)
@@ -37,8 +37,8 @@ def export(
         output: file to write; formats below
         quiet: no progress bars
         files: how the files are written.
-        source: what completes a bare .npy.
-        controls: what is changed in the animations.
+        source: mesh, frame rate and unit of a bare .npy.
+        controls: changes of the animations.
     """
     check_source(source)
 
@@ -62,15 +62,15 @@ def export(
     check_export(output, options, len(animations), weights=weights)
     check_controls(controls)
     read = SourceReader(source).read
-    finished: list[Animation] = [read(path) for path in animations]
+    motions: list[Animation] = [read(path) for path in animations]
     if not controls.is_off:
         from facediff.editing.controlled import apply_controls
 
-        finished = [apply_controls(animation, controls) for animation in finished]
-    for written in write_animations(output, with_different_names(finished, animations), options):
+        motions = [apply_controls(animation, controls) for animation in motions]
+    for written in write_animations(output, with_different_names(motions, animations), options):
         inside = [file for file in written.iterdir() if file.is_file()] if written.is_dir() else [written]
-        counted = f"{len(inside)} files, " if written.is_dir() else ""
-        tell(f"{written}: {counted}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
+        count = f"{len(inside)} files, " if written.is_dir() else ""
+        tell(f"{written}: {count}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
     if output.suffix in FORMATS:  # .fbx is made by another program
         tell(FORMATS[output.suffix].next_step)
 
@@ -85,7 +85,7 @@ def _may_have_weights(path: Path, lent: bool) -> bool:
         return True
     try:
         arrays = read_arrays(path, ("values", "faces", "template")) if path.suffix == ".npz" else {}
-    except FaceDiffError:  # whoever reads the file says what is wrong with it
+    except FaceDiffError:  # reading the file in full reports the reason
         return False
     if "values" in arrays or not {"faces", "template"} <= arrays.keys():
         return "values" in arrays

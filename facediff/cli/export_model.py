@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from facediff.cli.options import File, NewFolder
+from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
@@ -44,13 +45,10 @@ def export_model(
         identities: whose faces and styles the folder has (default: all that the model knows)
     """
     if model is None or bundled_by_name(model) is BUNDLED:
-        changed: dict[str, object] = {"sampler": sampler, "steps": steps, "quick-steps": quick_steps, "speech": speech}
-        changed |= {"identities": identities, "weights": None if weights == "float32" else weights}
-        for name, value in changed.items():
-            if value is not None:
-                raise FaceDiffError(
-                    f"--{name}: the model that comes with facediff is exported already; name a checkpoint"
-                )
+        options: dict[str, object] = {"sampler": sampler, "steps": steps, "quick_steps": quick_steps, "speech": speech}
+        options |= {"identities": identities, "weights": None if weights == "float32" else weights}
+        idle = {name: value is not None for name, value in options.items()}
+        refuse_idle("is for checkpoints, and the model that comes with facediff is exported already", **idle)
         from facediff.runtime.folder import copy_exported
 
         copied = copy_exported(model_or_bundled(model), output)

@@ -11,7 +11,6 @@ from facediff.cli.options import (
     File,
     FileOrList,
     FrameRate,
-    Output,
     Scheduler,
     Truth,
     View,
@@ -70,7 +69,7 @@ class FileOptions:
     unit: Annotated[str | None, Option(metavar="U")] = None
 
     def gather(self, predictions: str, truth: Path, page: PageOptions) -> tuple[Paper, FigureData]:
-        """The page and what is drawn on it."""
+        """The page and the data to draw."""
         methods = named_folders([predictions, *(self.method or [])])
         paper = page.paper()
         from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN
@@ -94,19 +93,17 @@ class PageOptions:
         font: an installed font; DejaVu Sans has the IPA
     """
 
-    output: Output
+    output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file", suffixes=(".png", ".pdf", ".svg"))]
     width: Annotated[ranges.PageWidth, Option(metavar="MM")] = 175.0
     dpi: Annotated[ranges.Resolution, Option(metavar="N")] = 300
     font: Annotated[str, Option(metavar="NAME")] = "DejaVu Sans"
 
     def paper(self) -> Paper:
-        """The page, after a check that the figure can be written."""
+        """The page; matplotlib must be there."""
         from facediff.evaluation.figures import Paper
-        from facediff.evaluation.figures.page import check_output
         from facediff.reporting.drawing import matplotlib
 
         matplotlib()
-        check_output(self.output)
         return Paper(self.width, self.dpi, self.font)
 
 
@@ -138,34 +135,29 @@ def frames(
         regions: for --close-up: folder with lve.txt or FLAME_masks.pkl
         lips: for --close-up: the lips, as `facediff evaluate` takes them
         view: camera
-        files: what is drawn.
+        files: the files to draw from.
         page: how it is printed.
     """
     if bool(times) == bool(phonemes):
-        raise FaceDiffError("choose what the columns show, with either --times or --phonemes")
+        raise FaceDiffError("expected either --times or --phonemes, which name the columns")
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import Moment, draw_frames, find_phoneme
     from facediff.evaluation.figures.gather import phonemes_of
 
-    chosen = material.choose([clip] if clip else None)[0]
-    spoken = phonemes_of(material, chosen, phoneme_file)
+    name = material.choose([clip] if clip else None)[0]
+    track = phonemes_of(material, name, phoneme_file)
     if times:
-        moments = [Moment(time, next((p for p in spoken if p.start <= time < p.end), None)) for time in times]
-    elif not spoken:
-        raise FaceDiffError(
-            f"nothing says when which phoneme of {chosen} is spoken; give --phoneme-file, a table with the columns "
-            f"start, end (seconds) and ipa, or choose --times"
-        )
+        moments = [Moment(time, next((p for p in track if p.start <= time < p.end), None)) for time in times]
     else:
-        spoken_then = [find_phoneme(name, spoken, chosen) for name in phonemes or []]
-        moments = [Moment(phoneme.middle, phoneme) for phoneme in spoken_then]
+        matches = [find_phoneme(selector, track, name) for selector in phonemes or []]
+        moments = [Moment(phoneme.middle, phoneme) for phoneme in matches]
     region = None
     if close_up:
         from facediff.evaluation import read_region
 
         folder = regions or (material.corpus / "regions" if material.corpus else None)
         region = read_region("lips", material.n_vertices, folder=folder, source=lips).indices
-    draw_frames(material, chosen, moments, page.output, paper=paper, view=view, region=region)
+    draw_frames(material, name, moments, page.output, paper=paper, view=view, region=region)
     report(page.output)
 
 
@@ -204,7 +196,7 @@ def heatmap(
         truth: corpus folder, folder of truths, or puppet
         highest_std: end of the standard deviation's scale
         maps: which clips, and how they are shown.
-        files: what is drawn.
+        files: the files to draw from.
         page: how it is printed.
     """
     paper, material = files.gather(predictions, truth, page)
@@ -231,7 +223,7 @@ def error(
         statistic: over frames
         highest_max: end of the maximum's scale
         maps: which clips, and how they are shown.
-        files: what is drawn.
+        files: the files to draw from.
         page: how it is printed.
     """
     refuse_idle(
@@ -289,20 +281,20 @@ def lips(
         audio: the clip's speech (default: the corpus's)
         phoneme_file: table of start, end, ipa (default: the corpus's)
         span: seconds to show (default: all)
-        files: what is drawn.
+        files: the files to draw from.
         page: how it is printed.
     """
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import SpeechTrack, draw_lips, opening_curves, read_pairs
     from facediff.evaluation.figures.gather import phonemes_of, sound_of
 
-    chosen = material.choose([clip] if clip else None)[0]
-    curves, note = opening_curves(material, chosen, read_pairs(lip_pairs, material.corpus, material.n_vertices))
-    samples = sound_of(material, chosen, audio)
-    notes = [f"{chosen}: {note}"] if note else []
+    name = material.choose([clip] if clip else None)[0]
+    curves, note = opening_curves(material, name, read_pairs(lip_pairs, material.corpus, material.n_vertices))
+    samples = sound_of(material, name, audio)
+    notes = [f"{name}: {note}"] if note else []
     if samples is None:
-        notes.append(f"there is no sound of {chosen}; give --audio to have its waveform")
-    phonemes = phonemes_of(material, chosen, phoneme_file)
+        notes.append(f"there is no sound of {name}; give --audio to have its waveform")
+    phonemes = phonemes_of(material, name, phoneme_file)
     sound = SpeechTrack(phonemes=phonemes) if samples is None else SpeechTrack(samples, phonemes=phonemes)
     draw_lips(curves, sound, page.output, paper=paper, scale=material.scale, span=span, remark=material.remark)
     report(page.output, notes)
@@ -324,7 +316,7 @@ def training(
         scalar: such as val/lve, repeatable (default: train/loss, val/lve)
         smooth: weight of the past, 0 to below 1
         log: logarithmic values
-        x: what the curves are over
+        x: the horizontal axis
         page: how it is printed.
     """
     folders = named_folders(runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))

@@ -33,7 +33,7 @@ class SampleOptions:
         references: samples of each clip with each of up to eight references and labels
         sampler: sampler by name; see `facediff components sampler`
         steps: denoising steps of the sampler
-        expressivity: 0 for the mean of what the model finds possible, 1 for a sample (default: the checkpoint's)
+        expressivity: 0 for the predicted mean, 1 for a sample (default: the checkpoint's)
         low_latency: frame by frame, as `facediff live` does
         seed: of the first sample; the others follow
     """
@@ -87,13 +87,11 @@ def generation_metrics(
         json: write everything as JSON
         csv: write one row for each split and metric
         quiet: no progress bar
-        samples: what is asked of the models.
+        samples: how many motions, and how they are sampled.
         licence: which models are refused.
     """
     for path in [*checkpoints, *([] if against is None else [against])]:
         check_model_source(path)
-    if len({*map(str, checkpoints)}) < len(checkpoints):
-        raise FaceDiffError("a checkpoint is given twice; name it once")
     for name in splits or ():
         if name not in SPLITS:
             raise FaceDiffError(f"--splits {name}: there is no such split; expected one of {', '.join(SPLITS)}")
@@ -115,9 +113,9 @@ def generation_metrics(
     reference = {} if stored is None else means_of(stored, f"--against {against}")
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
     splits = list(dict.fromkeys(splits)) if splits else data.test_splits
-    others = [] if against is None or reference else [against]
+    compared = [] if against is None or reference else [against]
     counts = [min(len(data.clips(name)), max_clips or 10**9) for name in splits]
-    total = sum(counts) * (len(checkpoints) + len(others))
+    total = sum(counts) * (len(checkpoints) + len(compared))
     with progress_bar("clips", total, shown=not quiet) as step:
 
         def results(paths: list[Path]) -> GenerationScores:
@@ -127,9 +125,11 @@ def generation_metrics(
             return measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
 
         scores = results(checkpoints)
-        if others:
-            other = results(others)
-            reference = {split: {name: other.mean(split, name) for name in own} for split, own in other.values.items()}
+        if compared:
+            earlier = results(compared)
+            reference = {
+                split: {name: earlier.mean(split, name) for name in values} for split, values in earlier.values.items()
+            }
     if against is not None:
         scores = replace(scores, against=reference, against_name=str(against))
     if json is not None:
@@ -158,10 +158,10 @@ def text(scores: GenerationScores) -> str:
 
     kind = "SYNTHETIC corpus" if scores.synthetic else "corpus"
     counts = ", ".join(f"{count} of {split}" for split, count in scores.clips.items())
-    drawn = (
+    sampled = (
         f"{scores.samples} samples each" if scores.samples > 1 else "one motion each, since it has no noise: spread 0"
     )
-    lines = [f"{kind} {scores.corpus}; clips: {counts}; {drawn}; {scores.sampler}"]
+    lines = [f"{kind} {scores.corpus}; clips: {counts}; {sampled}; {scores.sampler}"]
     if len(scores.checkpoints) > 1:
         lines.append(f"mean ± standard deviation over {len(scores.checkpoints)} checkpoints")
     if scores.against_name:
@@ -174,9 +174,9 @@ def text(scores: GenerationScores) -> str:
             cell = None if mean is None else number(mean)
             if cell is not None and deviation is not None:
                 cell += f" ± {number(deviation)}"
-            other = scores.against.get(split, {}).get(name)
-            if cell is not None and mean is not None and other:
-                cell += f" [{mean / other:.3f}]"
+            reference = scores.against.get(split, {}).get(name)
+            if cell is not None and mean is not None and reference:
+                cell += f" [{mean / reference:.3f}]"
             cells.append(cell)
         if any(cell is not None for cell in cells):
             rows.append([scores.title(name), *cells])

@@ -40,7 +40,7 @@ def import_checkpoint(
         files: the checkpoint; both of a method with two stages; of VOCA the checkpoint and DeepSpeech's graph
         output: checkpoint to write (.ckpt)
         doctor: write nothing, and print how the files differ from what is expected: names, shapes, hashes of files
-        facts: what the checkpoint does not hold
+        facts: identities, mesh and corpus, which the checkpoint does not hold
         licence: which licences are accepted
     """
     from facediff.models.published.importing import examine, import_files, save_model
@@ -72,7 +72,7 @@ def import_checkpoint(
     if model.animates:
         tell(f"next: facediff animate speech.wav --checkpoint {output} -o speech.npy")
     else:
-        tell(f"next: train what hears speech on it, with --model.prior={output}")
+        tell(f"next: train a model of speech on it, with --model.prior={output}")
 
 
 def few(names: Sequence[str]) -> str:
@@ -97,6 +97,6 @@ def gathered(ignored: Mapping[str, str]) -> list[tuple[str, str]]:
         parts.setdefault((name.split(".")[0], why), []).append(name)
     by_reason: dict[str, list[str]] = {}
     for (part, why), names in parts.items():
-        shown = names if len(names) <= MOST_NAMED else [f"{part}.… of {len(names)} tensors"]
-        by_reason.setdefault(why, []).extend(shown)
+        labels = names if len(names) <= MOST_NAMED else [f"{part}.… of {len(names)} tensors"]
+        by_reason.setdefault(why, []).extend(labels)
     return [(", ".join(names), why) for why, names in by_reason.items()]

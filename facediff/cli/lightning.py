@@ -42,7 +42,7 @@ HELP = """usage: facediff {name} [--config FILE] [--OPTION=VALUE ...]
   --trainer.OPTION        options of Lightning's Trainer: --trainer.max_epochs=20, --trainer.callbacks+=EarlyStopping
   --optimizer, --lr_scheduler
                           class and options in place of the model's: --optimizer=SGD --optimizer.lr=0.1
-  --ckpt_path FILE        checkpoint to {purpose}; last and best are those of the newest run of the config
+  --ckpt_path FILE        checkpoint to {purpose}; last or best of the newest run of the config
   --name NAME             name of the experiment, and of the folder below runs/
   --seed_everything SEED  seed of all random numbers
   --print_config          print the whole configuration, and stop
@@ -64,7 +64,7 @@ SUMMARIES = {
 }
 
 REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--trainer.plugins", "--print_config")
-"""What options begin with that add to what is there."""
+"""Options that may be repeated, since they add to earlier ones; prefixes."""
 
 FREE = (
     *("sampler", "sampling_space", "expressivity", "speech_guidance", "identity_guidance", "style_guidance"),
@@ -86,9 +86,8 @@ def lightning(name: str, arguments: Sequence[str]) -> int:
 
 
 def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
-    """Run one of Lightning's subcommands; the object that holds what it made: trainer, model, data module."""
-    check_options(name, arguments)
-    options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
+    """Run one of Lightning's subcommands; the object holds its trainer, model and data module."""
+    options = checked_words(name, arguments)
     tell_replaced_loggers(options)
     checkpoint = value_of(options, "--ckpt_path")
     if checkpoint not in (None, "last", "best"):  # which depend on the config
@@ -108,10 +107,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
 
     if name == "fit":
         keep_freed_memory()
-    for kind in registry.KINDS.values():
-        kind.load()
-    if os.getcwd() not in sys.path:  # a corpus or a component may be a file of the working folder
-        sys.path.append(os.getcwd())
+    load_components()
     with exit_statuses():
         return run_lightning_cli(name, options, experiment_name(options) or name)
 
@@ -131,20 +127,35 @@ def keep_freed_memory() -> bool:
 
 
 def parse_fit(arguments: Sequence[str]) -> tuple[str, str, dict[str, Any]]:
-    """Check the words of ``facediff fit`` without running it: names, options and values of model, data and trainer.
-
-    Returns:
-        class of the model, class and options of the data module.
-    """
-    check_options("fit", arguments)
-    options = change_values(as_parts(change_values(arguments, find_config)), fresh_component)
+    """Check the words of ``facediff fit`` without running it; class of the model, class and options of the data."""
+    options = checked_words("fit", arguments)
     from facediff.cli.lightning_cli import parse_lightning_cli
 
+    load_components()
+    return parse_lightning_cli(options)
+
+
+def checked_words(name: str, arguments: Sequence[str]) -> list[str]:
+    """The words of a subcommand with the files of their configs, once there are enough of them."""
+    if not any(re.match(r"-c|-h|--(config|model|data|help|ckpt_path)\b", word) for word in arguments):
+        needs = {"fit": "--config FILE, such as configs/experiment/puppet.yaml, or --model=NAME and --data=NAME"}
+        scoring = "--ckpt_path CHECKPOINT, a file of `facediff fit`, which holds everything else"
+        raise FaceDiffError(f"`facediff {name}` needs {needs.get(name, scoring)}")
+    checkpoint = value_of(arguments, "--ckpt_path")
+    if checkpoint in ("last", "best") and not any(re.match(r"-c|-h|--(config|model|help)\b", w) for w in arguments):
+        raise FaceDiffError(
+            f"--ckpt_path {checkpoint}: the config says where the runs are; add the run's --config, or give the path "
+            f"of its checkpoints/{checkpoint}.ckpt"
+        )
+    return change_values(as_parts(change_values(arguments, find_config)), fresh_component)
+
+
+def load_components() -> None:
+    """Register everything that can be chosen by name; a corpus or a component may be a file of the working folder."""
     for kind in registry.KINDS.values():
         kind.load()
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
-    return parse_lightning_cli(options)
 
 
 @contextmanager
@@ -167,20 +178,6 @@ def exit_statuses() -> Iterator[None]:
             signal.signal(signal.SIGINT, interrupt)
 
 
-def check_options(name: str, arguments: Sequence[str]) -> None:
-    """Refuse too few options."""
-    if not any(re.match(r"-c|-h|--(config|model|data|help|ckpt_path)\b", word) for word in arguments):
-        needs = {"fit": "--config FILE, such as configs/experiment/puppet.yaml, or --model=NAME and --data=NAME"}
-        scoring = "--ckpt_path CHECKPOINT, a file that `facediff fit` has written; it holds everything else"
-        raise FaceDiffError(f"`facediff {name}` needs {needs.get(name, scoring)}")
-    checkpoint = value_of(arguments, "--ckpt_path")
-    if checkpoint in ("last", "best") and not any(re.match(r"-c|-h|--(config|model|help)\b", w) for w in arguments):
-        raise FaceDiffError(
-            f"--ckpt_path {checkpoint}: the config says where the runs are; add the --config that training began with, "
-            f"or give the path of the run's checkpoints/{checkpoint}.ckpt"
-        )
-
-
 def refuse_repeated(arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice with different values: the last one would win without a word."""
     values: dict[str, str] = {}
@@ -195,20 +192,12 @@ def refuse_repeated(arguments: Sequence[str]) -> None:
 
 
 def import_corpus(
-    path: Path, checkpoint: Mapping[str, Any], chosen: str | None, option: str
+    path: Path, checkpoint: Mapping[str, Any], corpus: str | None, option: str
 ) -> type[SpeechMotionDataModule] | None:
-    """Import the corpus's class that the user names, which may be a file of the working folder.
+    """Import the corpus's class by the import path that the user gives; it may be a file of the working folder.
 
-    It is never imported because a checkpoint names it; the error then says how the user can.
-
-    Args:
-        path: the checkpoint.
-        checkpoint: its content.
-        chosen: the class that the user names; None if the checkpoint's is to be used.
-        option: the command's option for it.
-
-    Returns:
-        the class of an import path that the user names; else None.
+    It is never imported because a checkpoint names it; the error then says how the user can. ``option`` is the
+    command's, for that error.
     """
     from facediff.cli.data import find_own_module
     from facediff.data import SpeechMotionDataModule
@@ -216,19 +205,17 @@ def import_corpus(
     from facediff.data.check.layouts import by_name
     from facediff.utils.hints import is_path
 
-    named = (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")
-    if chosen is not None and "." in chosen:
-        find_own_module(chosen)
-        return by_name(chosen, None, option.rstrip(" ="))
-    if (
-        chosen is None
-        and is_path(named)
-        and registry.find_class(registry.corpus, named, SpeechMotionDataModule) is None
-    ):
+    if corpus is not None:
+        if "." not in corpus:
+            return None
+        find_own_module(corpus)
+        return by_name(corpus, None, option.rstrip(" ="))
+    trained = (checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path")
+    if is_path(trained) and registry.find_class(registry.corpus, trained, SpeechMotionDataModule) is None:
         raise FaceDiffError(
-            f"{path}: was trained on the corpus {named}, which is not known here and was not imported. If it is your "
-            f"own, add  {option}{named}  and run the command in the folder of its file; docs/own_data.md says how to "
-            f"register it once and for all"
+            f"{path}: was trained on the corpus {trained}, which is not known here and was not imported. If it is your "
+            f"own, add  {option}{trained}  and run the command in the folder of its file; docs/own_data.md says how "
+            f"to register it once and for all"
         )
     return None
 
@@ -236,29 +223,26 @@ def import_corpus(
 def import_model(arguments: Sequence[str]) -> str | None:
     """Import the model's class that the user names by ``--model`` or in a config; it may be a file of this folder.
 
-    Like a corpus's, it is never imported because a checkpoint names it.
-
-    Returns:
-        the class; None if none is named.
+    Like a corpus's, it is never imported because a checkpoint names it. None if none is named.
     """
     from facediff.cli.data import find_own_module
     from facediff.utils.hints import is_path
 
-    named = [value_of(arguments, "--model"), *map(class_of, config_files(arguments))]
-    chosen = next((name for name in named if is_path(name)), None)
-    if chosen is not None:
-        find_own_module(chosen)
+    names = [value_of(arguments, "--model"), *map(class_of, config_files(arguments))]
+    model = next((name for name in names if is_path(name)), None)
+    if model is not None:
+        find_own_module(model)
         try:
-            importlib.import_module(chosen.rpartition(".")[0])
+            importlib.import_module(model.rpartition(".")[0])
         except Exception as error:  # a module can fail in any way while it is imported
             raise FaceDiffError(
-                f"--model {chosen}: cannot be imported ({place_of(error)}); expected package.module.Class"
+                f"--model {model}: cannot be imported ({place_of(error)}); expected package.module.Class"
             ) from error
-    return chosen
+    return model
 
 
 def tell_folder(path: Path, options: Mapping[str, Any]) -> None:
-    """Say which folder is read because a checkpoint, which may come from anybody, names it."""
+    """Report the folder that is read because a checkpoint, which may come from a stranger, names it."""
     if options.get("root") is not None:
         tell(f"{path}: names the corpus folder {options['root']}, which is read")
 
@@ -266,14 +250,7 @@ def tell_folder(path: Path, options: Mapping[str, Any]) -> None:
 def corpus_and_folder(
     path: Path, checkpoint: Mapping[str, Any], corpus: str | None, root: Path | None
 ) -> tuple[type[SpeechMotionDataModule], dict[str, Any]]:
-    """The data module's class that a checkpoint was trained with, and its options.
-
-    Args:
-        path: the checkpoint.
-        checkpoint: its content.
-        corpus: the class that the user names by ``--corpus``, if any.
-        root: where the user says that the corpus is; None for where the checkpoint says.
-    """
+    """The data module's class that a checkpoint was trained with, and its options."""
     from facediff.models.checkpoint import corpus_of
 
     import_corpus(path, checkpoint, corpus, "--corpus ")
@@ -329,15 +306,14 @@ def tell_replaced_loggers(arguments: Sequence[str]) -> None:
 
 
 def experiment_name(arguments: Sequence[str]) -> str | None:
-    """What the runs are called: the option ``name``, or the file name of the first config of an experiment.
+    """The name of the runs: the option ``name``, or the file name of the first config of an experiment.
 
-    Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it. None if
-    nothing names it.
+    Configs of callbacks or loggers alone, which are given in addition to an experiment's, do not name it; None then.
     """
     files = config_files(arguments)
     stated = [value_of(arguments, "--name"), *(name_of(file) for file in reversed(files))]
-    named = (Path(file).stem for file in files if {"model", "data"} & keys_of(file))
-    return next((name for name in stated if name is not None), next(named, None))
+    stems = (Path(file).stem for file in files if {"model", "data"} & keys_of(file))
+    return next((name for name in stated if name is not None), next(stems, None))
 
 
 def config_files(arguments: Sequence[str]) -> list[str]:
@@ -356,11 +332,11 @@ def config_files(arguments: Sequence[str]) -> list[str]:
 def fresh_component(flag: str, value: str) -> str:
     """Let a component that is chosen by name start from its own defaults.
 
-    jsonargparse hands options of the same name on from the component that stood there before, even where those were
-    mere defaults: ``--model.sampler=ddpm`` would silently keep the 25 steps of ``ddim``.
+    jsonargparse hands options of the same name on from the previous component, even if those were mere defaults:
+    ``--model.sampler=ddpm`` would silently keep the 25 steps of ``ddim``.
     """
-    words = flag.removesuffix(".help").split(".") if flag.startswith("--model.") else [""]
-    kind = registry.COMPONENTS.get(words[-1])
+    option = flag.removesuffix(".help").rpartition(".")[2] if flag.startswith("--model.") else ""
+    kind = registry.COMPONENTS.get(option)
     if kind is not None and flag.endswith(".help") and value in kind.names():
         return f"facediff.registry.{kind.kind}.{value}"
     if kind is None or not re.fullmatch(r"[a-z]\w*", value) or Path(value).is_file() or value == "null":
@@ -382,14 +358,14 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     from facediff.models.checkpoint import corpus_of, read_checkpoint
     from facediff.models.loading import build_model
 
-    own = import_model(arguments)
+    model = import_model(arguments)
     checkpoint = read_checkpoint(path)
-    build_model(path, checkpoint)  # what Lightning would stumble over is reported before it starts
+    build_model(path, checkpoint)  # reports a damaged checkpoint before Lightning starts
     if name == "fit":
         return []
     hparams = checkpoint["hyper_parameters"]
-    # The checkpoint's own class says no more than whose code may be imported.
-    same = ("--model", f"--model={own}") if own == hparams["_class_path"] else ()
+    # The checkpoint's own class only permits the import of its code.
+    same = ("--model", f"--model={model}") if model == hparams["_class_path"] else ()
     changes = [word for word in arguments if re.match(rf"--model(?!\.(init_args\.)?({'|'.join(FREE)})\b)\b", word)]
     changes = [word for word in changes if word not in same]
     if changes:
@@ -399,14 +375,14 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
         )
     options = {key: value for key, value in hparams.items() if not key.startswith("_") and key not in LINKS}
     config = {"seed_everything": 0, "model": {"class_path": hparams["_class_path"], "init_args": options}}
-    chosen = value_of(arguments, "--data")
-    if chosen is not None and chosen.endswith((".yaml", ".yml")) and Path(chosen).is_file():
-        chosen = class_of(chosen)
-    imported = import_corpus(path, checkpoint, chosen, "--data=")
+    data = value_of(arguments, "--data")
+    if data is not None and data.endswith((".yaml", ".yml")) and Path(data).is_file():
+        data = class_of(data)
+    imported = import_corpus(path, checkpoint, data, "--data=")
     trained = str((checkpoint.get(DATA_SOURCE_KEY) or {}).get("class_path"))
     if imported is not None and imported is registry.find_class(registry.corpus, trained, SpeechMotionDataModule):
-        chosen = trained
-    if chosen in (None, trained, trained.rpartition(".")[2]):
+        data = trained
+    if data in (None, trained, trained.rpartition(".")[2]):
         corpus, corpus_options = corpus_of(path, checkpoint)
         if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in arguments):
             tell_folder(path, corpus_options)

@@ -40,7 +40,7 @@ from facediff.cli.process import chain
 from facediff.cli.trainer_options import IDLE_WARNINGS, check_trainer, without_warnings
 from facediff.cli.words import explain
 from facediff.data import SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError
+from facediff.errors import ArgumentError, FaceDiffError, needs_extra
 from facediff.hyperparameters import plain
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
@@ -55,13 +55,7 @@ LINKS = ("n_vertices", "identities", "frame_rate", "space", "faces")
 
 
 def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> FaceDiffCLI:
-    """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`.
-
-    Args:
-        name: of the subcommand.
-        arguments: its options.
-        experiment: what runs are called.
-    """
+    """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`."""
     logger = {"class_path": LOGGERS[0], "init_args": {"save_dir": "runs", "name": experiment}}
     with (
         parsing([name, *arguments], experiment),
@@ -79,12 +73,10 @@ def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> F
 
 
 @contextmanager
-def parsing(words: Sequence[str], experiment: str) -> Iterator[None]:
+def parsing(arguments: Sequence[str], experiment: str) -> Iterator[None]:
     """Have Lightning parse some words; an error of ours that a library has wrapped comes out as it was.
 
-    Args:
-        words: the subcommand, if it runs, and its options.
-        experiment: what ``${experiment_name:}`` stands for in a config of 1.x.
+    ``experiment`` replaces ``${experiment_name:}`` in configs of 1.x.
     """
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
     guard_configs("omegaconf+")
@@ -93,30 +85,30 @@ def parsing(words: Sequence[str], experiment: str) -> Iterator[None]:
     register_type(torch.device, str, torch.device, fail_already_registered=False)
     yaml.SafeDumper.add_multi_representer(Enum, lambda dumper, member: dumper.represent_data(member.value))
     # Lightning starts the other processes of a distributed run with the words of this one.
-    argv, sys.argv = sys.argv, [sys.argv[0], *words]
+    argv, sys.argv = sys.argv, [sys.argv[0], *arguments]
     try:
         yield
     except ParsingError as error:
         reason = " ".join(line.strip()[:160] for line in str(error).splitlines())
-        raise FaceDiffError(explain(words) or reason) from error
+        raise FaceDiffError(explain(arguments) or reason) from error
     except Exception as error:
-        ours = next((cause for cause in chain(error) if isinstance(cause, FaceDiffError)), None)
-        if ours is None and any(restores(cause) for cause in chain(error)):
-            raise FaceDiffError(
+        cause = next((cause for cause in chain(error) if isinstance(cause, FaceDiffError)), None)
+        if isinstance(cause, ArgumentError) and not any(name[0].isupper() for name in cause.values):
+            cause = FaceDiffError(cause.sentence("--"))
+        if cause is None and any(restores(reason) for reason in chain(error)):
+            cause = FaceDiffError(
                 f"--ckpt_path: training cannot continue from this checkpoint ({brief(error)}); it is damaged, or of "
                 f"another model or trainer. Give the config of its run, or train from the beginning"
-            ) from error
-        if isinstance(ours, ArgumentError) and not any(name[0].isupper() for name in ours.values):
-            raise FaceDiffError(ours.sentence("--")) from error
-        if ours is None or ours is error:
+            )
+        if cause is None or cause is error:
             raise
-        raise ours from error
+        raise cause from error
     finally:
         sys.argv = argv
 
 
 def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, str, dict[str, Any]]:
-    """Parse the words of ``fit`` and make nothing of them; class of the model, class and options of the data module."""
+    """Parse the words of ``fit``, and instantiate nothing; class of the model, class and options of the data."""
     with parsing(arguments, "benchmark"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         parsed = ParsedCLI(save_config_callback=None, command="fit", experiment="benchmark", run=False)
@@ -135,19 +127,19 @@ def restores(error: BaseException) -> bool:
 
 
 RESUME_WARNINGS = (".*callbacks used to create the checkpoint need to be provided", "The dirpath has changed from")
-"""They matter to training that goes on; scoring a checkpoint needs none of its callbacks."""
+"""They matter to resumed training; scoring a checkpoint needs none of its callbacks."""
 
 LOGGERS = tuple(f"lightning.pytorch.loggers.{name}Logger" for name in ("CSV", "TensorBoard", "Wandb"))
 """Loggers that are called after the experiment where they are not given a name."""
 
 
 class FaceDiffCLI(LightningCLI):
-    """LightningCLI whose experiment has a name, and whose model takes its sizes from the data module.
+    """LightningCLI with a name for the experiment, and a model that takes its sizes from the data module.
 
     Args:
         command: the subcommand.
-        experiment: what the runs are called.
-        until_end: what lasts as long as the subcommand.
+        experiment: name of the runs.
+        until_end: contexts that last as long as the subcommand.
         options: the base class's.
     """
 
@@ -163,7 +155,7 @@ class FaceDiffCLI(LightningCLI):
         self.command = command
         self.experiment = experiment
         self.checkpoint: str | None = None
-        # Abbreviations are guesses: the option that one stands for changes when another option is added.
+        # Abbreviations are guesses: they change their meaning when another option is added.
         parser = {"parser_mode": "omegaconf+", "exit_on_error": False, "allow_abbrev": False}
         super().__init__(
             AnimationModel,
@@ -232,14 +224,14 @@ class FaceDiffCLI(LightningCLI):
         requeue_on_signal(trainer)
         built_in = self.trainer_defaults["callbacks"]
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-        named = {type(callback) for callback in callbacks if callback not in built_in}
+        stated_types = {type(callback) for callback in callbacks if callback not in built_in}
         if self.command != "fit":  # a checkpoint's weights are the average
             callbacks[:] = [callback for callback in callbacks if not isinstance(callback, WeightAveraging)]
         if stated.get("enable_checkpointing") is False:
-            named.add(LastCheckpoint)
-        if not trainer.loggers:  # which bundled configs have it for; Lightning refuses it alone
+            stated_types.add(LastCheckpoint)
+        if not trainer.loggers:  # Lightning refuses LearningRateMonitor without a logger
             callbacks[:] = [callback for callback in callbacks if not isinstance(callback, LearningRateMonitor)]
-        callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in named]
+        callbacks[:] = [c for c in callbacks if c not in built_in or type(c) not in stated_types]
         if type(trainer.strategy.checkpoint_io) is TorchCheckpointIO:  # written whole, read by the one door
             trainer.strategy.checkpoint_io = AtomicCheckpointIO()
         if bar_in_a_pipe and self.command == "fit":
@@ -272,8 +264,8 @@ class FaceDiffCLI(LightningCLI):
         self.model.check_training(resumed=bool(content))
         if content and schedule_changed(content, self._stated("lr_scheduler")):
             raise FaceDiffError(
-                f"--lr_scheduler: the training of {path} has another one, whose state cannot be taken over; give the "
-                f"config of its run, or start a new training"
+                f"--lr_scheduler: differs from the one of {path}, and its state cannot be restored; give the config of "
+                f"its run, or start a new training"
             )
         run = continued_run(trainer, self.entries(), path, content, sys.argv)
         self.until_end.enter_context(entered_run(trainer, self.entries(), run, content))
@@ -302,7 +294,7 @@ def refuse_missing_corpus(data: Mapping[str, Any]) -> None:
 
 
 class ParsedCLI(FaceDiffCLI):
-    """Parses, and makes nothing of what it has parsed."""
+    """Parses, and instantiates nothing."""
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: ANN401
         """Parse, and leave the random numbers alone."""
@@ -367,21 +359,16 @@ def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
     """Let a run that logs to Weights & Biases record offline where it could not upload.
 
     Without a key wandb asks a question and waits for an answer, and without a network it waits for a minute and a half
-    and then fails. Here one line says why the run is offline and how it is uploaded later. Whoever has chosen a mode
-    (``WANDB_MODE``, or ``offline: true``) keeps it.
-
-    Args:
-        trainer: the trainer's options as parsed, before anything is made of them.
+    and then fails. Here one line says why the run is offline and how it is uploaded later. A mode that is set by
+    ``WANDB_MODE`` or ``offline: true`` stays.
     """
     from lightning.pytorch.utilities import rank_zero_only
 
     options = logger_options(trainer, "WandbLogger")
     if options is None or getattr(rank_zero_only, "rank", None):  # other processes of a run log nothing
         return
-    try:
+    with needs_extra("wandb", "wandb", "logging to Weights & Biases"):
         import wandb
-    except ModuleNotFoundError as error:
-        raise MissingExtraError("wandb", "wandb", "logging to Weights & Biases") from error
     if os.environ.get("WANDB_MODE") or options.get("offline") or wandb.run is not None:
         return
     silent = os.environ.get("WANDB_SILENT")

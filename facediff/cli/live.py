@@ -20,7 +20,7 @@ from facediff.utils.hub import BUNDLED, check_animating_source, is_audio2face, m
 from facediff.utils.option import Option
 
 SOUNDS = (".wav", ".flac", ".ogg", ".mp3", ".opus")
-"""What a recording's name may end in where it stands in the model's place, for the model that comes with facediff."""
+"""Suffixes by which a recording is recognised in the model's place; the bundled model animates it then."""
 
 if TYPE_CHECKING:
     from facediff.live.model import LiveModel
@@ -35,14 +35,13 @@ def live(
     generation: GenerationOptions,
     windows: WindowOptions,
     controls: AnimationControls,
-    place: DeviceOptions,
+    device: DeviceOptions,
 ) -> None:
     """Animate live speech, and send it to engines, browsers and other programs.
 
-    Frames leave at their rate, each at its time; frames that come too late are dropped. How long after the speech that
-    is (the lag) is reported every few seconds and at the end. Ctrl-C ends the performance. Frames are generated one by
-    one, with low latency, unless --window or --overlap are given. --blinks, --gaze and --sway need recordings as a
-    whole: they are for `facediff animate`.
+    Frames leave at their rate, each at its time; late frames are dropped. The lag behind the speech is reported every
+    few seconds and at the end. Ctrl-C ends the performance. Frames are generated one by one, with low latency, unless
+    --window or --overlap are given. --blinks, --gaze and --sway need whole recordings: they are for `facediff animate`.
 
     For example:
       facediff live --microphone --to browser
@@ -55,11 +54,11 @@ def live(
         speech: recording, played in real time; - for 16-bit samples (mono, little endian) on standard input
         checkpoint: trained model (.ckpt), a folder of `facediff publish` or `facediff export-model`, or USER/NAME of
             the Hugging Face hub
-        performance: where the speech comes from, and where the frames go.
+        performance: the source of the speech and the receivers of the frames.
         generation: whose face, in which style, how.
         windows: how long speech is cut.
-        controls: what is changed after inference.
-        place: where the model computes.
+        controls: changes after inference.
+        device: where the model computes.
     """
     if checkpoint is not None:
         if speech is not None:
@@ -74,7 +73,7 @@ def live(
     # Frames of Audio2Face-3D have a window each, and a low latency by themselves.
     if windows.window is None and windows.overlap is None and not is_audio2face(model):
         windows = replace(windows, low_latency=True)
-    options = AnimationOptions.of(generation, windows, controls, place, checkpoint=model)
+    options = AnimationOptions.of(generation, windows, controls, device, checkpoint=model)
     from facediff.live.command import perform, print_report
     from facediff.pipelines.animate import check_options
 
@@ -99,7 +98,7 @@ def live_model(options: AnimationOptions) -> LiveModel:
     pipeline = open_pipeline(options)
     if pipeline.rest is not None and pipeline.gate == USUAL_GATE:
         pipeline.rest.mouth.gate = read_gate(usual_gate(pipeline.stream_timing[0])) or pipeline.rest.mouth.gate
-    pipeline.stream()  # what cannot be streamed is refused before anything is opened
+    pipeline.stream()  # refuses options that cannot be streamed, before anything is opened
     face, channels = pipeline.facts, pipeline.gives_channels
     return LiveModel(
         start=partial(pipeline.stream, channels=channels),

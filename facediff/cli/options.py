@@ -43,7 +43,7 @@ Text = Annotated[str | None, Option(metavar="NAME")]
 
 
 def require_truth(path: Path | None) -> None:
-    """Refuse what is neither a folder nor the name of the built-in corpus."""
+    """Refuse a path that is neither a folder nor the name of the built-in corpus."""
     if path is not None and not path.is_dir() and str(path) != "puppet":
         raise FaceDiffError(f"{path}: no such folder; expected a corpus, a folder of truths or animations, or puppet")
 
@@ -56,7 +56,7 @@ class PageServer:
     """Page (of a command that serves one).
 
     Attributes:
-        host: address to listen at; by default nobody but this machine reaches it
+        host: address to listen at; by default only this machine reaches it
         port: to listen at; 0 for any free one (default: 8000 for a study, 8010 for a model)
         open: open the page in the browser
     """
@@ -66,17 +66,15 @@ class PageServer:
     open: bool = False
 
     def announce(self, text: str, action: str) -> Callable[[str], None]:
-        """What is called with the page's address once it is served: it prints the text, and opens the page.
+        """A callback that gets the page's address once it is served, prints the text, and opens the page.
 
-        Args:
-            text: after the address.
-            action: what others may do who reach the page.
+        ``action`` is what visitors may do, for a note where others reach the page.
         """
 
         def ready(address: str) -> None:
             tell(f"{address} {text}")
             if self.host not in LOOPBACK:
-                tell(f"note: everybody who reaches {self.host} may {action}, without encryption")
+                tell(f"note: all who reach {self.host} may {action}, without encryption")
             if self.open:
                 import webbrowser
 
@@ -95,7 +93,7 @@ def check_source(source: SourceOptions) -> None:
 
 
 def with_different_names(animations: Sequence[Animation], paths: Sequence[Path]) -> list[Animation]:
-    """The animations under their own names; where those are alike, as of one recording, under their files' names."""
+    """The animations under their names, or under their files' where those are alike, as of one recording."""
     alike = len({animation.name for animation in animations}) < len(animations)
     return [
         replace(animation, name=valid_text(path.stem if alike else animation.name))
@@ -104,19 +102,17 @@ def with_different_names(animations: Sequence[Animation], paths: Sequence[Path])
 
 
 def named_folders(
-    words: Sequence[str], name_of: Callable[[Path], str] = lambda path: path.resolve().name
+    arguments: Sequence[str], name_of: Callable[[Path], str] = lambda path: path.resolve().name
 ) -> dict[str, Path]:
     """Folders by name, from words NAME=FOLDER, or FOLDER, which ``name_of`` names; all of them exist."""
     folders: dict[str, Path] = {}
-    for word in words:
+    for word in arguments:
         name, equals, folder = word.partition("=")
         if not equals or Path(word).exists():
             name, folder = name_of(Path(word)), word
-        if not name or not folder:
-            raise FaceDiffError(f"{word}: expected NAME=FOLDER")
+        if not name or not folder or not Path(folder).exists():
+            raise FaceDiffError(f"{folder or word}: no such folder; expected NAME=FOLDER")
         if name in folders:
             raise FaceDiffError(f'{word}: there is already one called "{name}"; name it with NAME=FOLDER')
-        if not Path(folder).exists():
-            raise FaceDiffError(f"{folder}: no such folder")
         folders[name] = Path(folder)
     return folders

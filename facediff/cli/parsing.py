@@ -21,7 +21,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
 from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices
@@ -97,24 +97,23 @@ class Parameter:
 
     def read(self, word: str) -> Any:  # noqa: ANN401 - the type of the hint
         """One word of the command line as a value."""
-        bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
+        hint = Annotated[self.value_type, self.range or Range()] if self.is_number else self.value_type
+        value, expected = None, "a path" if self.is_path else "text"
         try:
-            if self.is_number:
-                return (self.range or Range()).read(self.flag, word, whole=self.value_type is int)
-            if get_origin(self.value_type) is Literal:
-                return read(self.value_type, word)
-            if not word.strip():
-                raise ValueError("a path" if self.is_path else "text")
-            if self.has_commas:
-                names = [name.strip() for name in word.split(",")]
-                if "" in names or len({*names}) < len(names):
-                    raise ValueError("different names with commas between")
-                return names
-        except FaceDiffError as error:
-            raise FaceDiffError(f"{error}{bare}") from error
+            if self.is_number or get_origin(hint) is Literal:
+                value = read(hint, word)
+            elif word.strip():
+                value = Path(word) if self.is_path else word
         except ValueError as error:
-            raise FaceDiffError(f"{self.flag} {shown(word)}: expected {error}") from error
-        return Path(word) if self.is_path else word
+            expected = str(error)
+        if self.has_commas and value is not None:
+            names = [name.strip() for name in word.split(",")]
+            value = names if "" not in names and len({*names}) == len(names) else None
+            expected = "different names with commas between"
+        if value is None:
+            bare = f"; {self.flag} without a value goes to the end" if self.option.bare is not None else ""
+            raise FaceDiffError(f"{self.flag} {shown(word)}: expected {expected}{bare}")
+        return value
 
 
 Parameters = Mapping[str, "Parameter | OptionGroup"]
@@ -125,7 +124,7 @@ Parameters = Mapping[str, "Parameter | OptionGroup"]
 class OptionGroup:
     """A dataclass parameter: options that several commands share."""
 
-    made: type
+    dataclass: type
     title: str
     details: str
     parameters: list[Parameter]
@@ -188,7 +187,7 @@ def summary_of(documented: object) -> tuple[str, str]:
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Help whose defaults are added where they say something."""
+    """Help with defaults, where they are informative."""
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text = action.help or ""
@@ -289,7 +288,7 @@ def parse(
     return {
         name: values[name]
         if isinstance(entry, Parameter)
-        else entry.made(**{p.name: values[p.name] for p in entry.parameters})
+        else entry.dataclass(**{p.name: values[p.name] for p in entry.parameters})
         for name, entry in parameters.items()
     }
 
@@ -303,35 +302,35 @@ def with_dashes(word: str) -> str:
 def refuse_repeated(parameters: Sequence[Parameter], arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice: argparse would drop the first value without a word."""
     once = {flag: p for p in parameters if p.given_once for flag in (p.flag, p.option.also)}
-    seen: set[str] = set()
+    names: set[str] = set()
     for word in arguments[: arguments.index("--") if "--" in arguments else None]:
         parameter = once.get(word.partition("=")[0] if word.startswith("--") else word[:2])
-        if parameter is not None and parameter.name in seen:
+        if parameter is not None and parameter.name in names:
             fix = "give all its values after one" if parameter.is_list else "give it once"
             raise FaceDiffError(f"{parameter.flag}: is given twice; {fix}")
-        seen |= {parameter.name} if parameter is not None else set()
+        names |= {parameter.name} if parameter is not None else set()
 
 
 def refuse_ineffective(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
     """Refuse options that are given, but would change nothing beside the others, or for want of another one."""
-    given = {p.name: p for p in parameters if values[p.name] not in (p.default, None, [])}
-    for parameter in given.values():
-        needed, excluding = parameter.option.needs.split(), parameter.option.without.split()
-        if needed and not given.keys() & needed:
+    present = {p.name: p for p in parameters if values[p.name] not in (p.default, None, [])}
+    for parameter in present.values():
+        needed, excluding = parameter.option.needs.split(), present.keys() & parameter.option.without.split()
+        if needed and not present.keys() & needed:
             flags = " or ".join(p.flag for p in parameters if p.name in needed)
-            raise FaceDiffError(f"{parameter.flag}: has no effect without {flags}; omit it")
-        for name in given.keys() & excluding:
-            raise FaceDiffError(f"{parameter.flag}: has no effect with {given[name].flag}; omit it")
+            refuse_idle(f"has no effect without {flags}", **{parameter.name: True})
+        for name in excluding:
+            refuse_idle(f"has no effect with {present[name].flag}", **{parameter.name: True})
 
 
-def refuse_idle(reason: str, **given: bool) -> None:
-    """Refuse options that were given, but change nothing because of what no declaration says.
+def refuse_idle(reason: str, **options: bool) -> None:
+    """Refuse options without an effect, such as those of batches for one recording.
 
     Args:
         reason: where the options have an effect, as in "is for one recording".
-        given: whether an option was given, by its name.
+        options: whether an option was given, by its name.
     """
-    for name, is_given in given.items():
+    for name, is_given in options.items():
         if is_given:
             raise FaceDiffError(f"--{name.replace('_', '-')}: {reason}; omit it")
 
@@ -341,12 +340,12 @@ def changed(options: Any) -> dict[str, bool]:  # noqa: ANN401 - an instance of a
     return {field.name: getattr(options, field.name) != field.default for field in dataclasses.fields(options)}
 
 
-def arguments_of(function: Callable[..., Any], program: str, words: Sequence[str]) -> dict[str, Any]:
+def arguments_of(function: Callable[..., Any], program: str, arguments: Sequence[str]) -> dict[str, Any]:
     """The arguments of a command function, read from a command line."""
     summary, details = summary_of(function)
     late: Callable[[], str] | None = getattr(function, "more_help", None)
     text = details if late is None else lambda: f"{details}\n\n{late()}".strip()
-    return parse(parameters_of(function), words, program, summary, text)
+    return parse(parameters_of(function), arguments, program, summary, text)
 
 
 Function = typing.TypeVar("Function", bound=Callable[..., Any])

@@ -1,8 +1,8 @@
-"""Files and folders of a command line: which are read, which are written, and what is refused before any work.
+"""Files and folders of a command line: which are read, which are written, and which are refused before any work.
 
 Every option and argument that is a path says so (:class:`facediff.utils.option.Option`); the checks here are the same
-for all commands. What a command finds out later, such as the names of further files, is checked by the same rules where
-it is written (:mod:`facediff.utils.files`).
+for all commands. Files with names that a command finds later are checked where they are written
+(:mod:`facediff.utils.files`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import check_folder_writable, check_writable
@@ -20,7 +20,7 @@ from facediff.utils.output_paths import protect, refuse_equal, refuse_overwritin
 
 
 class Parameter(Protocol):
-    """What a check needs to know of a command's parameter, which facediff.cli.parsing reads from a signature."""
+    """The parts of a command's parameter that checks read (:mod:`facediff.cli.parsing` makes it)."""
 
     @property
     def name(self) -> str:
@@ -42,33 +42,32 @@ class Parameter(Protocol):
 def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
     """Refuse, before any work is done, files that cannot be read or written, and outputs that are inputs.
 
-    The inputs are protected from then on: nothing that the command writes replaces one of them.
-
-    Args:
-        parameters: of the command.
-        values: what was given for them, by name.
+    The inputs are protected from then on: no output of the command replaces one of them.
     """
     inputs: list[Path] = []
     outputs: list[Path] = []
     for parameter in parameters:
         option = parameter.option
         for path in given_paths(parameter, values.get(parameter.name)):
+            problem, cause = "", cast(Exception | None, None)
             try:
                 written = option.writes and not (option.reads and path.exists())
                 if str(path) == "-" and (written or option.dash):
-                    if not option.dash:
-                        raise FaceDiffError("-: is not standard output here; expected the name of a file")
+                    problem = "" if option.dash else "is not standard output here; expected the name of a file"
                 elif option.suffixes and path.suffix.lower() not in option.suffixes:
-                    raise FaceDiffError(f"{path}: expected a name that ends in {' or '.join(option.suffixes)}")
+                    problem = f"expected a name that ends in {' or '.join(option.suffixes)}"
                 elif written:
-                    check_output(option, path)
+                    problem = output_problem(option, path)
                     outputs.append(path)
                 elif parameter.is_path or path.exists():  # a text may be a name, or a path
-                    check_input(option, path)
+                    problem = input_problem(option, path)
                     inputs.append(path)
-            except (FaceDiffError, OSError) as error:
-                reason = f"{path}: {error.strerror}" if isinstance(error, OSError) else error
-                raise FaceDiffError(f"{parameter.flag} {reason}") from error
+            except FaceDiffError as error:
+                problem, cause = str(error).removeprefix(f"{path}: "), error
+            except OSError as error:
+                problem, cause = str(error.strerror), error
+            if problem:
+                raise FaceDiffError(f"{parameter.flag} {path}: {problem}") from cause
     refuse_equal(outputs)
     refuse_overwriting(inputs, outputs)
     protect(inputs)
@@ -92,29 +91,29 @@ def given_paths(parameter: Parameter, value: Any) -> Iterator[Path]:  # noqa: AN
 
 
 def exists(text: str) -> bool:
-    """Whether a text is the path of something; no text is too long for that."""
+    """Whether a text is the path of a file or folder; no text is too long for that."""
     try:
         return os.path.lexists(text)
     except (OSError, ValueError):
         return False
 
 
-def check_output(option: Option, path: Path) -> None:
-    """Refuse a file or a folder that cannot be written, or has content that would be mixed with what is written."""
+def output_problem(option: Option, path: Path) -> str:
+    """Why a file or a folder cannot be written; empty if it can."""
     if option.new and path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise FaceDiffError(f"{path}: exists already; choose another folder, or remove it")
+        return "exists already; choose another folder, or remove it"
     if option.writes == "folder" or (option.writes == "file or folder" and path.is_dir()):
         check_folder_writable(path)
     else:
         check_writable(path)
+    return ""
 
 
-def check_input(option: Option, path: Path) -> None:
-    """Refuse what is neither a file nor a folder, or not there although it must be."""
+def input_problem(option: Option, path: Path) -> str:
+    """Why a file or a folder cannot be read; empty if it can."""
     present = {"file": path.is_file, "folder": path.is_dir}.get(option.exists, path.exists)()
     if option.exists and not present:
-        raise FaceDiffError(f"{path}: no such {option.exists}")
+        return f"no such {option.exists}"
     if path.exists() and not path.is_file() and not path.is_dir():
-        raise FaceDiffError(f"{path}: is a device or a pipe; expected a file, or a folder of files")
-    if path.exists() and not os.access(path, os.R_OK):
-        raise FaceDiffError(f"{path}: cannot be read (permission denied)")
+        return "is a device or a pipe; expected a file, or a folder of files"
+    return "cannot be read (permission denied)" if path.exists() and not os.access(path, os.R_OK) else ""

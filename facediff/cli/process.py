@@ -1,4 +1,4 @@
-"""The process of a command: standard streams, what it prints and asks, signals and exit statuses.
+"""The process of a command: standard streams, output, questions, signals and exit statuses.
 
 A command is stopped by an exception in any case, so that half-written files are removed on the way out.
 """
@@ -31,7 +31,7 @@ LONG, LARGE = 3600.0, 8 * 2**30
 
 
 class StandardOutputError(FaceDiffError):
-    """What a command prints cannot be printed."""
+    """The output of a command cannot be printed."""
 
     def __init__(self, error: OSError) -> None:
         super().__init__(
@@ -42,7 +42,7 @@ class StandardOutputError(FaceDiffError):
 
 def prepare_process() -> None:
     """Set up the streams and signals of a process that does nothing but run a command."""
-    # A file that is opened while the number of a standard stream is free would get that number and what is printed.
+    # A file that is opened while the number of a standard stream is free would get that number, and the output.
     for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -90,13 +90,13 @@ class _StandardOutput(io.FileIO):
         try:
             return super().write(data)
         except OSError as error:
-            # What comes later, such as the rest of the buffer at the end of the process, goes nowhere.
+            # Later output, such as the rest of the buffer at the end of the process, goes nowhere.
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             raise StandardOutputError(error) from error
 
 
 def tell(*lines: object) -> None:
-    """Print lines to standard output, in which names of files may hold what is no text, or not one line.
+    """Print lines to standard output; names of files in them may hold line breaks or bytes that are no text.
 
     Everything that the commands print goes this way; where standard output is a pipe, it is flushed immediately.
     """
@@ -107,7 +107,7 @@ def tell(*lines: object) -> None:
 
 
 def confirm_cost(yes: bool, lower: str, *, seconds: float = 0.0, size: float = 0.0) -> None:
-    """Name what a command is going to take where that is much, and start only if the user agrees.
+    """Name the cost of a command where it is high, and start only if the user agrees.
 
     Args:
         yes: whether the user has agreed beforehand.
@@ -136,18 +136,17 @@ def flush() -> None:
 def fail(message: str, status: int = USAGE) -> int:
     """Print one sentence to standard error and give back the exit status."""
     # Names of files may hold line breaks and the codes by which terminals are controlled, or be as long as a page.
-    shown = printable(message)
-    shown = shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}…"
+    text = printable(message)
+    text = text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
     with suppress(OSError, ValueError):  # standard error is closed or full: the status has to do
-        print(f"facediff: error: {shown}", file=sys.stderr, flush=True)
+        print(f"facediff: error: {text}", file=sys.stderr, flush=True)
     return status
 
 
 def report(error: BaseException) -> int:
-    """Print what has ended a command, in one sentence; the exit status.
+    """Print the error that has ended a command, in one sentence; the exit status.
 
-    Raises:
-        BaseException: the error itself where it is unexpected and ``FACEDIFF_TRACEBACK`` is set.
+    An unexpected error is raised again where ``FACEDIFF_TRACEBACK`` is set.
     """
     if any(isinstance(cause, KeyboardInterrupt) for cause in chain(error)):
         return fail("interrupted", INTERRUPTED)
@@ -177,20 +176,20 @@ def report(error: BaseException) -> int:
     if text.startswith("Does not validate"):  # jsonargparse's list of types, around what a constructor raised
         error = list(chain(error))[-1]
         text = " ".join(str(error).split())
-    place, ours = _place(error)
+    position, is_bug = _position(error)
     return fail(
-        f"unexpected {type(error).__name__}: {text[:300]} ({place}, facediff {facediff.__version__}); "
-        f"{'this is a fault of facediff: ' if ours else ''}run the command again with {TRACEBACK}=1"
-        f"{' and report what it prints' if ours else ', which shows where'}",
+        f"unexpected {type(error).__name__}: {text[:300]} ({position}, facediff {facediff.__version__}); "
+        f"{'this is a fault of facediff: ' if is_bug else ''}run the command again with {TRACEBACK}=1"
+        f"{' and report what it prints' if is_bug else ', which shows where'}",
         FAULT,
     )
 
 
 def chain(error: BaseException | None) -> Iterator[BaseException]:
     """An exception and what it came from, outermost first."""
-    seen: set[int] = set()
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
+    visited: set[int] = set()
+    while error is not None and id(error) not in visited:
+        visited.add(id(error))
         yield error
         error = error.__cause__ or error.__context__
 
@@ -209,12 +208,12 @@ def _refuses(error: BaseException) -> bool:
     return module.partition(".")[0] in LIBRARIES and not fault
 
 
-def _place(error: BaseException) -> tuple[str, bool]:
-    """The innermost line that is in no library, and whether it is facediff's: it may be in a file of the user's."""
+def _position(error: BaseException) -> tuple[str, bool]:
+    """The innermost line outside the libraries, and whether it is facediff's rather than a user's."""
     import traceback
 
     package, libraries = Path(__file__).parents[1], ("site-packages", os.path.dirname(os.__file__))
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<")]
     frames = [frame for frame in frames if not any(library in frame.filename for library in libraries)] or frames
-    ours = not frames or package in Path(frames[-1].filename).parents
-    return (f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else "in a library"), ours
+    is_bug = not frames or package in Path(frames[-1].filename).parents
+    return (f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else "in a library"), is_bug

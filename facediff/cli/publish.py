@@ -31,9 +31,9 @@ def publish(
 ) -> None:
     """Write a trained model as a folder that others can use, and send it to the Hugging Face hub.
 
-    The folder holds the weights, what animation needs of the corpus, licence labels and a model card (README.md), and
-    nothing that only training needs: it cannot be trained on with `facediff fit`. Wherever a command takes a
-    checkpoint, it takes such a folder too, and user/name[@revision] of the hub.
+    The folder holds the weights, the corpus's mesh and templates, licence labels and a model card (README.md), but no
+    state of the training: `facediff fit` cannot continue from it. Wherever a command takes a checkpoint, it takes such
+    a folder too, and user/name[@revision] of the hub.
 
     For example:
       facediff publish demo/puppet.ckpt puppet --license apache-2.0
@@ -43,12 +43,12 @@ def publish(
     Args:
         checkpoint: trained model (.ckpt), a model folder, or user/name[@revision] of the hub
         folder: new folder to write
-        license: licence of the weights, such as apache-2.0 or cc-by-nc-4.0 (default: that of the data)
+        license: licence of the weights, such as apache-2.0 or cc-by-nc-4.0 (default: the data's)
         half: store the weights in 16 bits: half as large; the motion differs a little
-        name: what the card calls the model (default: that of --push, else the folder's)
+        name: the model's name on the card (default: from --push, else the folder's)
         scores: test_scores.csv of `facediff test` for this model, for the card (default: the one next to the
             checkpoint, if it is not older)
-        languages: codes of the languages that it was trained on, en,zh-CN (default: those of its corpus)
+        languages: codes of the languages that it was trained on, en,zh-CN (default: its corpus's)
         push: send the folder to this name on the hub; log in with `hf auth login` before
         private: with --push: a new model is visible to its owner alone
         licence: which models are refused.
@@ -61,17 +61,17 @@ def publish(
     from facediff.models.pretrained import published_licences
     from facediff.utils.licences import in_words
 
-    found = scores or scores_next_to(checkpoint)
+    table = scores or scores_next_to(checkpoint)
     model = load_model(checkpoint, commercial_only=licence.commercial_only)
     model.provenance = {"published_from": hub.model_name(checkpoint), **model.provenance}
     model.save_pretrained(
-        folder, half=half, license=license, name=name or push, scores=found, languages=languages or None
+        folder, half=half, license=license, name=name or push, scores=table, languages=languages or None
     )
     labels = in_words(published_licences(model.licences, license))
     size = sum(path.stat().st_size for path in folder.iterdir())
     weights = (folder / hub.WEIGHTS).stat().st_size
     tell(f"{folder}: {size / 1e6:.1f} MB, {weights / 1e6:.1f} of them weights; licence: {labels}")
-    tell(f"{folder / hub.CARD}: model card, {'without scores' if found is None else f'scores from {found}'}")
+    tell(f"{folder / hub.CARD}: model card, {'without scores' if table is None else f'scores from {table}'}")
     source = str(folder)
     if push is not None:
         tell(f"sent to {hub.push(folder, push, private=private)}")

@@ -1,4 +1,4 @@
-"""``facediff benchmark referee``: models of every kind on one face, scored by what phonemes ask of it."""
+"""``facediff benchmark referee``: models of every kind on one face, scored against the phonemes of its speech."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def referee(
       facediff benchmark referee puppet.ckpt --motion theirs=out --layout arkit
 
     Args:
-        models: what is compared; see above
+        models: models to compare; see above
         output: folder for the report
         motion: folder of motion that another program made of the speech of --write-speech, called as the recordings;
             repeatable
         layout: layout of .npy and .npz in parameters, such as arkit or flame_artalk (docs/parameters.md)
-        frame_rate: frames a second of motion that does not say it
+        frame_rate: frames a second of motion without a stated rate
         flame: your FLAME model file, which shows FLAME's coefficients on the face; without it, only their jaw is scored
-        languages: codes of what is spoken: en, de, es, fr, it, cmn (default: all)
+        languages: codes of the languages: en, de, es, fr, it, cmn (default: all)
         voices: voices of each language, as far as they are installed
         sentences: sentences of each voice
         write_speech: write the speech for models that run elsewhere, and do nothing else
@@ -64,7 +64,7 @@ def referee(
     from facediff.synthetic.spoken_set import LANGUAGES, spoken_set, write_spoken_set
 
     if write_speech is None:
-        import facediff.benchmark.referee  # noqa: F401 - what is missing is named before anybody speaks
+        import facediff.benchmark.referee  # noqa: F401 - a missing package is named before any synthesis
 
     codes = [*LANGUAGES] if languages is None else list(languages)
     clips = spoken_set(codes, voices, sentences)
@@ -77,8 +77,6 @@ def referee(
     from facediff.benchmark.results import code_of
     from facediff.metrics import device_name
 
-    if not clips:
-        raise FaceDiffError("--languages: names none; expected such as en,de")
     candidates = candidates_of(models or [], motion or [], layout, frame_rate)
     rows = []
     for number, candidate in enumerate(candidates, 1):
@@ -87,10 +85,10 @@ def referee(
         tell(f"[{number}/{len(candidates)}] {candidate.name}: {state}")
     if all(row.problem for row in rows):
         raise FaceDiffError(f"no model could be scored, the first: {rows[0].name}: {rows[0].problem}")
-    words = [*(models or []), *(f"--motion={word}" for word in motion or [])]
-    words += [f"--flame={flame}"] if flame is not None else []
-    words += [f"--languages={','.join(codes)}", f"--voices={voices}", f"--sentences={sentences}"]
-    command = shlex.join(["facediff", "benchmark", "referee", *words])
+    options = [*(models or []), *(f"--motion={word}" for word in motion or [])]
+    options += [f"--flame={flame}"] if flame is not None else []
+    options += [f"--languages={','.join(codes)}", f"--voices={voices}", f"--sentences={sentences}"]
+    command = shlex.join(["facediff", "benchmark", "referee", *options])
     report = RefereeReport(clips, reference_judgement(clips), rows, command, code_of(), device_name("cpu"))
     files = write_report(report, output)
     tell(*text(report).split("\n"), *(f"written: {path}" for path in files))
@@ -103,20 +101,20 @@ def judged(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None
     from facediff.pipelines.candidates import perform
     from facediff.utils.workers import WorkerDied, in_own_process
 
-    made = in_own_process(partial(perform, clips=clips, flame=flame), candidate)
-    if isinstance(made, WorkerDied):
+    motion = in_own_process(partial(perform, clips=clips, flame=flame), candidate)
+    if isinstance(motion, WorkerDied):
         return Judgement(candidate.name, problem="killed its process, perhaps for lack of memory")
-    if isinstance(made, str):
-        return Judgement(candidate.name, problem=made)
-    scores, faults, openings = judge(clips, made.clips, made.frame_rate, made.jaw)
-    facts = {"put on the face": made.way, "licence": made.licence, "commercial use": made.commercial_use}
-    return Judgement(candidate.name, scores, faults, facts, made.seconds, made.memory, made.frame_rate, openings)
+    if isinstance(motion, str):
+        return Judgement(candidate.name, problem=motion)
+    scores, faults, openings = judge(clips, motion.clips, motion.frame_rate, motion.jaw)
+    facts = {"put on the face": motion.way, "licence": motion.licence, "commercial use": motion.commercial_use}
+    return Judgement(candidate.name, scores, faults, facts, motion.seconds, motion.memory, motion.frame_rate, openings)
 
 
 def candidates_of(
     models: Sequence[str], motion: Sequence[str], layout: str | None, frame_rate: float | None
 ) -> list[Candidate]:
-    """What is compared: from words and plans."""
+    """The models to compare, from the command line and from plans."""
     from facediff.pipelines.candidates import Candidate
 
     candidates: list[Candidate] = []
@@ -135,9 +133,9 @@ def candidates_of(
     if not candidates:
         candidates = [Candidate("puppet", str(BUNDLED))]
     names = [candidate.name for candidate in candidates]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise FaceDiffError(f'{twice}: two models are called "{twice}"; name them with NAME=PATH')
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise FaceDiffError(f"{repeated}: is the name of two models; name them with NAME=PATH")
     return candidates
 
 
@@ -152,10 +150,10 @@ def read_models(path: Path) -> list[Candidate]:
     candidates = []
     for name, value in models.items() if isinstance(models, dict) else ():
         content = value if isinstance(value, dict) else {"model": value}
-        place = f"{path}: models.{name}"
-        candidate = read_record(Candidate, {**content, "name": name}, place)
+        entry = f"{path}: models.{name}"
+        candidate = read_record(Candidate, {**content, "name": name}, entry)
         if (candidate.model is None) == (candidate.motion is None):
-            raise FaceDiffError(f"{place}: expected either a model or a folder of motion")
+            raise FaceDiffError(f"{entry}: expected either a model or a folder of motion")
         if candidate.model is not None:
             check_animating_source(candidate.model)
         candidates.append(candidate)

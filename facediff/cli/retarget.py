@@ -29,17 +29,17 @@ class TransferOptions:
 
     Attributes:
         correspondence: .npz to use if it exists, else to write for other animations
-        landmarks: places that are the same: .csv with a pair of vertices a line, counted from 0, or a name for a
-            vertex, such as `nose_tip,4034`; or the .json that was picked
+        landmarks: corresponding points: .csv with a pair of vertices a line, counted from 0, or a name for a vertex,
+            such as `nose_tip,4034`; or the .json that was picked
         part: names of the parts that show the face, by node, mesh, group or material; `*` stands for any letters
             (default: it is searched for in all parts). Teeth and tongue follow the jaw, other parts stand still
         pick: pick landmarks on a page in the browser first; they are saved next to the correspondence, or to OUT, as
             <name>.landmarks.json, and the command goes on with them
         show: picture of both faces at the widest mouth, a full blink and raised brows
-        accept_poor: write the animation although its lips, its folds or its coverage are found to be wrong
+        accept_poor: write the animation even if its lips, its folds or its coverage are wrong
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
             (default for a .glb from a .glb that has materials, skins or targets)
-        bare_face: write the animated surface alone, without what else the target .glb has
+        bare_face: write the animated surface alone, without the other parts of the target .glb
         own_shapes: of a target .glb, drive its own shapes (ARKit's, VRM's or Oculus' names) and its bones for head,
             eyes and jaw, and add none. Weights go by name where the motion has ARKit's or is of the built-in face,
             without any search; else they are solved for on the target
@@ -73,9 +73,9 @@ def retarget(
         animation: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
         target_mesh: the other face at rest: .obj, .ply, .glb …
         output: file to write
-        transfer: how the motion finds its place on the mesh.
+        transfer: how the motion is mapped to the mesh.
         page: where landmarks are picked.
-        source: what completes a bare .npy.
+        source: mesh, frame rate and unit of a bare .npy.
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
@@ -100,13 +100,11 @@ def retarget(
     dressed = transfer.add_to_mesh or (
         not transfer.bare_face and holds_glb(output) and has_materials_or_targets(target_mesh)
     )
-    if (dressed or transfer.own_shapes) and output.exists() and output.samefile(target_mesh):
-        raise FaceDiffError(f"--output {output}: is the target mesh; name another file")
     avatar = own_shapes(target_mesh) if transfer.own_shapes else None
     motion = SourceReader(source).read(animation)
     driven = [] if avatar is None else [avatar.summary, *avatar.left_out(motion)]
     if avatar is not None and has_arkit_weights(motion):
-        idle = {name: given for name, given in changed(transfer).items() if name not in ("own_shapes", "quiet")}
+        idle = {name: is_set for name, is_set in changed(transfer).items() if name not in ("own_shapes", "quiet")}
         refuse_idle("has no effect, since the motion's weights go by name to --own-shapes", **idle)
         written = write_animations(output, [motion], ExportOptions(), into=target_mesh, own_shapes=True)
         tell(*written, *([] if transfer.quiet else driven))
@@ -120,7 +118,7 @@ def retarget(
 def write_transferred(
     motion: Animation, target: Path, output: Path, options: TransferOptions, *, dressed: bool, driven: list[str]
 ) -> None:
-    """Transfer a motion by the surface, write it, and say how well it fits.
+    """Transfer a motion by the surface, write it, and report how well it fits.
 
     Args:
         motion: the animation.
@@ -128,7 +126,7 @@ def write_transferred(
         output: file to write.
         options: of the command.
         dressed: whether a copy of the target's file is written, with materials, skins and targets.
-        driven: what is to be said of the shapes that the target has itself.
+        driven: notes on the target's own shapes.
     """
     from facediff.editing.fit_check import refuse_poor
     from facediff.editing.retargeting import has_z_up, retarget
@@ -176,7 +174,7 @@ PICKED = ".landmarks.json"
 
 
 def landmarks_path(output: Path) -> Path:
-    """Where the landmarks are saved that are picked for a correspondence or an animation: next to it.
+    """The file of picked landmarks, next to a correspondence or an animation.
 
     Example:
         >>> landmarks_path(Path("out/map.npz")).as_posix()
@@ -186,13 +184,14 @@ def landmarks_path(output: Path) -> Path:
 
 
 def check_pick(picked: Path, landmarks: Path | None, correspondence: Path | None) -> None:
-    """Refuse, before anything is shown, what would make picking useless."""
+    """Refuse, before the page is shown, files that would make picking useless."""
+    problem = ""
     if correspondence is not None and correspondence.exists():
-        raise FaceDiffError(
-            f"--pick: {correspondence} exists and would be used without landmarks; remove it, or omit --pick"
-        )
+        problem = f"--pick: {correspondence} exists and would be used without landmarks; remove it, or omit --pick"
     if landmarks is not None and picked.exists() and landmarks.samefile(picked):
-        raise FaceDiffError(f"--landmarks {landmarks}: is what --pick continues from and writes anyway; omit it")
+        problem = f"--landmarks {landmarks}: --pick continues from this file and overwrites it; omit the option"
+    if problem:
+        raise FaceDiffError(problem)
     check_writable(picked)
 
 
@@ -212,15 +211,15 @@ def pick_on_page(animation: Animation, target: Path, options: TransferOptions, p
         parts=mesh_parts(target),
         host=page.host,
         port=page.port or 0,
-        announce=page.announce("shows both faces: pick the same places and save; Ctrl-C ends the command", "pick"),
+        announce=page.announce("shows both faces: pick corresponding points and save; Ctrl-C ends the command", "pick"),
     )
     if not saved:
         raise FaceDiffError("--pick: no landmarks were saved; save them on the page, or omit --pick")
     tell(picked)
 
 
-def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
-    """What of a mesh's texture coordinates and materials a file does not get, a sentence each."""
+def surface_notes(mesh: Path, output: Path, animation: Animation) -> list[str]:
+    """Texture coordinates and materials of a mesh that a file does not get, a sentence each."""
     from facediff.export import FORMATS
     from facediff.mesh.glb import open_glb
     from facediff.mesh.textures import has_textures, read_textures
@@ -230,14 +229,14 @@ def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
         return []
     textured = has_textures(mesh)
     if textured and (output.suffix.lower() == ".fbx" or "surface" in FORMATS[output.suffix].uses):
-        return list(read_textures(mesh, len(made.triangles)).losses)
+        return list(read_textures(mesh, len(animation.triangles)).losses)
     if is_glb:
         glb = open_glb(mesh)
         if not glb.entries("materials"):
             return []
-        lost = "materials, pictures and parts" if glb.entries("images") else "materials and parts"
-        shown = "" if made.colours is None else "the colours of materials are kept as those of vertices, and "
-        return [f"of {mesh.name}, {shown}{lost} are left out; write .glb to keep them"]
+        parts = "materials, pictures and parts" if glb.entries("images") else "materials and parts"
+        colours = "" if animation.colours is None else "the colours of materials are kept as vertex colours, and "
+        return [f"of {mesh.name}, {colours}{parts} are left out; write .glb to keep them"]
     if not textured:
         return []
     return [
@@ -246,18 +245,18 @@ def surface_notes(mesh: Path, output: Path, made: Animation) -> list[str]:
     ]
 
 
-def remarks(animation: Animation, made: Animation, found: Correspondence, report: FitReport) -> list[str]:
-    """What a user should know of a result, a sentence each."""
+def remarks(animation: Animation, transferred: Animation, fit: Correspondence, report: FitReport) -> list[str]:
+    """Size, distance and quality of a transfer, a sentence each."""
     import numpy as np
 
     from facediff.animation import metres_per_unit
 
-    millimetres = 1000 * metres_per_unit(made.unit)
-    still, unsure = np.count_nonzero(found.share == 0), np.count_nonzero(found.trust < 0.5)
+    millimetres = 1000 * metres_per_unit(transferred.unit)
+    still, unsure = np.count_nonzero(fit.share == 0), np.count_nonzero(fit.trust < 0.5)
     lines = [
-        f"{len(animation.template)} vertices to {len(made.template)}: the meshes lie "
-        f"{np.median(found.distances) * millimetres:.2g} mm apart (median), scale "
-        f"{found.similarity.scale:.4g}, unit {made.unit}",
+        f"{len(animation.template)} vertices to {len(transferred.template)}: the meshes lie "
+        f"{np.median(fit.distances) * millimetres:.2g} mm apart (median), scale "
+        f"{fit.similarity.scale:.4g}, unit {transferred.unit}",
         f"{unsure} vertices lie where the source has no similar surface and follow their neighbours; {still} lie far "
         f"from it and stand still",
     ]
@@ -268,15 +267,15 @@ def remarks(animation: Animation, made: Animation, found: Correspondence, report
 
 
 def axes_notes(fit: Correspondence, output: Path, copied: bool) -> list[str]:
-    """How the target mesh is turned, and how what is written; ``copied`` if that is a copy of the mesh's own file."""
+    """The up axes of the target mesh and of the written file, which is a copy of the mesh's own if ``copied``."""
     from facediff.editing.retargeting import has_z_up
     from facediff.export import FORMATS
 
     if has_z_up(fit) and not copied:
         form = FORMATS.get(output.suffix)
         if form is not None and "z" in form.up_axes:
-            return ["the target mesh has z up, and so has what is written"]
-        return ["the target mesh has z up and is turned: what is written has y up"]
+            return ["the target mesh has z up, and so has the written file"]
+        return ["the target mesh has z up and is turned: the written file has y up"]
     if fit.similarity.rotation[1, 1] < TURNED:
-        return ["the target mesh is turned against the animation, whose y axis points up; so is what is written"]
+        return ["the target mesh is turned against the animation, which has y up; so is the written file"]
     return []

@@ -52,7 +52,7 @@ def serve(
         size = write_site(site, output)
         tell(f"wrote {output}: {size / 1e6:.1f} MB; offer it by any web server, e.g. python -m http.server -d {output}")
         return
-    ready = page.announce(
+    announce = page.announce(
         f"animates with {model}; Ctrl-C ends it", "open the page; without https it gets no microphone"
     )
-    serve_site(site, host=page.host, port=8010 if page.port is None else page.port, ready=ready)
+    serve_site(site, host=page.host, port=8010 if page.port is None else page.port, ready=announce)

@@ -45,8 +45,8 @@ def make(
 
     Methods are folders with <clip>.npz of `facediff animate`, or <clip>.npy or <clip>_condition_<identity>.npy of
     `facediff predict`; clips are matched by name. The first method is compared with the others and with the truth.
-    What is drawn is kept, so that the same command continues after an interruption. OUT/page is what raters get;
-    OUT/study.json is the key, which says what is on which side.
+    Videos are kept, so that the same command continues after an interruption. OUT/page is for the raters;
+    OUT/study.json is the key: it says which method is on which side.
 
     Args:
         methods: folders of animations, each NAME=FOLDER
@@ -55,7 +55,7 @@ def make(
         style_references: folder of animations, <speaker>_….npz, shown with questions of style (default: other clips
             of the truth)
         identity: whose style predictions were given: own, or an identity's name
-        speech: folder of recordings named like the clips (default: the corpus's, or those that the animations hold)
+        speech: folder of recordings named like the clips (default: the corpus's, or the sound in the animations)
         mesh: triangles of .npy files: .ply, .obj … (default: the corpus's)
         frame_rate: frames a second of .npy files (default: the corpus's)
         unit: unit of length of .npy files (default: the corpus's)
@@ -63,7 +63,7 @@ def make(
         scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         quiet: no progress bar
         yes: start without a question, however long it takes
-        options: what is asked.
+        options: clips, design and questions.
     """
     folders = named_folders(methods)
     from facediff.study import plan_study
@@ -82,12 +82,12 @@ def make(
     for note in plan.notes:
         tell(f"note: {note}")
     confirm_cost(yes, "--max-clips or --size", seconds=plan.seconds / 2)
-    drawn = plan.make(output, workers=workers, scheduler=scheduler, progress=not quiet)
+    redrawn = plan.make(output, workers=workers, scheduler=scheduler, progress=not quiet)
     study = plan.study
     trials = study.trials_of(0)
     controls = sum(trial.kind != "pair" for trial in trials)
     tell(
-        f"{output}: {counted(len(plan.videos), 'video')} ({drawn} drawn, {len(plan.videos) - drawn} up to date) of "
+        f"{output}: {counted(len(plan.videos), 'video')} ({redrawn} drawn, {len(plan.videos) - redrawn} up to date) of "
         f"{counted(len(plan.clips), 'clip')} of {', '.join(study.conditions)}",
         f"a rater sees {counted(len(trials), 'video')}, {controls} of them controls, in about "
         f"{plan.minutes:.0f} minutes; sides and orders are balanced over {len(study.schedules)} raters",
@@ -104,8 +104,8 @@ def serve(
 ) -> None:
     """Serve a study to raters, until Ctrl-C. Answers go to STUDY/answers.sqlite, and nowhere else.
 
-    By default only this machine can open the page; --host 0.0.0.0 lets everybody in who reaches this machine, without
-    encryption: put a web server with HTTPS in front of it, and give its name by --name.
+    By default only this machine can open the page. --host 0.0.0.0 opens it to the network, without encryption: put a
+    web server with HTTPS in front of it, and give its name by --name.
 
     Args:
         study: folder that `facediff study make` has finished
@@ -116,12 +116,12 @@ def serve(
     """
     from facediff.study import serve as run
 
-    ready = page.announce(f"serves {study}; Ctrl-C ends it", "answer")
+    announce = page.announce(f"serves {study}; Ctrl-C ends it", "answer")
     port = 8000 if page.port is None else page.port
-    raters = run(study, host=page.host, port=port, name=name, most_raters=max_raters, ready=ready).raters()
-    finished = sum(rater.finished is not None for rater in raters)
+    raters = run(study, host=page.host, port=port, name=name, most_raters=max_raters, ready=announce).raters()
+    complete = sum(rater.finished is not None for rater in raters)
     tell(
-        f"{study}: {counted(len(raters), 'rater')}, {finished} of them finished; "
+        f"{study}: {counted(len(raters), 'rater')}, {complete} of them finished; "
         f"`facediff study report {study}` analyses them"
     )
 
@@ -144,14 +144,13 @@ def report(
 ) -> int:
     """Analyse the answers to studies, or say how many raters one needs.
 
-    Printed are shares of preference with intervals, Bradley-Terry scores, agreement and who is not counted; with -o,
-    also the table for a paper (Markdown, LaTeX, CSV), a page, and every answer (CSV, JSON). Several studies, such as
+    It prints shares of preference with intervals, Bradley-Terry scores, agreement and excluded raters; with -o, it
+    writes the table for a paper (Markdown, LaTeX, CSV), a page, and every answer (CSV, JSON). Several studies, such as
     biwi=FOLDER mead=FOLDER, become columns of one table. Exit status: 0 done, 1 answers had to be set aside.
 
     Args:
         studies: folders of `facediff study make`, each FOLDER or NAME=FOLDER
-        answers: files that raters have downloaded, and folders of them; those that `study serve` has stored are always
-            used
+        answers: files that raters have downloaded, and folders of them; answers stored by `study serve` are always used
         output: folder for all tables
         interval: of shares: Wilson's, or the exact binomial one
         level: of intervals
@@ -177,7 +176,7 @@ def report(
     options = {"interval": interval, "level": level, "resamples": bootstrap, "seed": seed}
     ids = [read_study(folder).id for folder in folders.values()]
     reports = [
-        analyse_folder(folder, answers or (), name=name, others=ids[:i] + ids[i + 1 :], **options)
+        analyse_folder(folder, answers or (), name=name, ignored=ids[:i] + ids[i + 1 :], **options)
         for i, (name, folder) in enumerate(folders.items())
     ]
     if json is not None and json != "-":
@@ -219,7 +218,7 @@ def print_plan(
         tell(
             f"{name}{': ' if name else ''}{needed.raters} raters notice a preference of {50 + 100 * difference:g} to "
             f"{50 - 100 * difference:g} with a chance of {power:.0%} at the level {level:g}",
-            f"({needed.answers} independent answers to each of {counted(pairs, 'comparison')}; {repeated}those that "
-            f"are not counted come on top)",
+            f"({needed.answers} independent answers to each of {counted(pairs, 'comparison')}; {repeated}excluded "
+            f"raters come on top)",
         )
     return 0

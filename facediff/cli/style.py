@@ -27,7 +27,7 @@ def extract(
         clips: motion of one speaker: .npy files of absolute vertices, or names of the corpus's clips (F1_e03)
         checkpoint: trained model (.ckpt)
         output: vector to write (.npy)
-        identity: whose motion it is, where the files' names do not say it; by default the first one trained on
+        identity: the speaker, where the files' names do not say it; by default the first one trained on
         licence: which models are refused.
     """
     check_model_source(checkpoint, "--checkpoint")

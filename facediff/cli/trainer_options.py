@@ -1,4 +1,4 @@
-"""What Lightning would do without a word: options of the trainer that are refused, and warnings that are not shown."""
+"""Options of the trainer that fail silently and are refused, and warnings of Lightning that are not shown."""
 
 from __future__ import annotations
 
@@ -15,12 +15,7 @@ HALF = ("bf16-true", "16-true", "transformer-engine", "transformer-engine-float1
 
 
 def check_trainer(options: Mapping[str, Any], command: str = "fit") -> None:
-    """Refuse what Lightning takes, and what makes a run that is worth nothing.
-
-    Args:
-        options: of the trainer.
-        command: fit, validate, test or predict.
-    """
+    """Refuse options that Lightning accepts and that make a run worthless; ``command`` is fit, validate and so on."""
     limit = f"limit_{ {'fit': 'train', 'validate': 'val'}.get(command, command) }_batches"
     precision, clipping = options.get("precision"), options.get("gradient_clip_val") or 0
     refused = {
@@ -46,12 +41,12 @@ IDLE_WARNINGS = (
     # Frozen layers are in evaluation mode on purpose: no dropout.
     r"Found \d+ module\(s\) in eval mode at the start of training",
 )
-"""Warnings of Lightning's that nobody needs to act on."""
+"""Warnings of Lightning that need no action."""
 
 
 @contextmanager
 def without_warnings(*messages: str) -> Iterator[None]:
-    """A context without warnings that begin with one of these patterns, and without what Lightning advertises."""
+    """A context without warnings that begin with one of these patterns, and without Lightning's advertisements."""
     log = logging.getLogger("lightning.pytorch.utilities.rank_zero")
     log.addFilter(_no_advertisement)
     with warnings.catch_warnings():

@@ -30,20 +30,20 @@ def view(
 ) -> None:
     """Write one HTML file that plays animations with their speech in any browser.
 
-    The page is one file that loads nothing from anywhere: mail it, put it on a share, open it by a double click.
-    Animations next to each other need one frame rate and one length. A bare .npy takes what it does not say from the
-    first .npz given, if both have equally many vertices.
+    The page is one file that loads nothing from the network: mail it, put it on a share, open it by a double click.
+    Animations next to each other need one frame rate and one length. A bare .npy takes mesh, frame rate and unit from
+    the first .npz given, if both have equally many vertices.
 
     Args:
         animations: motions, shown side by side: .npz, .npy, or ARKit's weights (.csv of Live Link Face, .json); four at
             most
         output: the page (.html)
-        truth: what the animations are compared with: shown first, and in heat maps
+        truth: the reference of the animations: shown first, and in heat maps
         labels: names to show, in the order of the panels
         shortest: cut all to the shortest instead of refusing
         max_mb: largest page written
         open: open the page in the browser
-        source: what completes a bare .npy.
+        source: mesh, frame rate and unit of a bare .npy.
     """
     paths = [*([] if truth is None else [truth]), *animations]
     check_source(source)
@@ -54,13 +54,13 @@ def view(
 
     from facediff.pipelines.motion import view as page_of
 
-    given = with_different_names(read_animations(paths, source), paths)
-    first = None if truth is None else given.pop(0)
-    page = page_of(given, truth=first, labels=labels, shortest=shortest)
+    panels = with_different_names(read_animations(paths, source), paths)
+    first = None if truth is None else panels.pop(0)
+    page = page_of(panels, truth=first, labels=labels, shortest=shortest)
     page.save(output, max_mb=max_mb)
-    shown = page.animations
     size = output.stat().st_size / 1e6
-    length = f"{counted(len(shown[0].vertices), 'frame')} of {counted(len(shown), 'animation')}"
+    frames, count = len(page.animations[0].vertices), len(page.animations)
+    length = f"{counted(frames, 'frame')} of {counted(count, 'animation')}"
     tell(f"{output}: {length}, {size:.1f} MB; open it in a browser")
     if open:
         import webbrowser
@@ -73,11 +73,11 @@ def read_animations(paths: Sequence[Path], source: SourceOptions) -> list[Animat
     from facediff.pipelines.motion import SourceReader
     from facediff.utils.arrays import open_vertices
 
-    completing = SourceReader(source)
-    whole = {path: completing.read(path) for path in paths if path.suffix == ".npz"}
-    lender = next(iter(whole.values()), None)
-    found: list[Animation] = []
+    reader = SourceReader(source)
+    archives = {path: reader.read(path) for path in paths if path.suffix == ".npz"}
+    lender = next(iter(archives.values()), None)
+    animations: list[Animation] = []
     for path in paths:
         alike = lender is not None and path.suffix == ".npy" and open_vertices(path).shape[1] == len(lender.template)
-        found.append(whole[path] if path in whole else completing.read(path, lender if alike else None))
-    return found
+        animations.append(archives[path] if path in archives else reader.read(path, lender if alike else None))
+    return animations

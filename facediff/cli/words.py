@@ -38,16 +38,13 @@ def value_of(arguments: Sequence[str], flag: str) -> str | None:
     return values.get(flag)
 
 
-def explain(words: Sequence[str]) -> str:
-    """What is wrong with a class that words or the files in them name; empty if nothing is.
+def explain(arguments: Sequence[str]) -> str:
+    """The fault of a class that words or the files in them name; empty if there is none.
 
     An error inside a file of the user's comes with its file and line; a name of a model, a corpus or a component that
     does not exist, with the nearest. Everything else is the parser's to say.
-
-    Args:
-        words: the options of the command line.
     """
-    named: list[tuple[str, str]] = []
+    classes: list[tuple[str, str]] = []
 
     def note(flag: str, value: str) -> str:
         option = "" if flag in ("-c", "--config") else flag.lstrip("-").removesuffix("+").removesuffix(".help")
@@ -55,21 +52,15 @@ def explain(words: Sequence[str]) -> str:
             content = yaml.load(value, yaml.BaseLoader)  # noqa: S506 - makes texts only
         except yaml.YAMLError:
             content = value
-        named.extend(classes_in(option, content, Path.cwd()))
+        classes.extend(classes_in(option, content, Path.cwd()))
         return value
 
-    change_values(words, note)
-    return next(filter(None, (fault_of(option, name) for option, name in dict.fromkeys(named))), "")
+    change_values(arguments, note)
+    return next(filter(None, (fault_of(option, name) for option, name in dict.fromkeys(classes))), "")
 
 
 def classes_in(option: str, content: Any, folder: Path) -> Iterator[tuple[str, str]]:  # noqa: ANN401
-    """Names and import paths of classes in a config's content, each with the option that it stands for.
-
-    Args:
-        option: its path, as the command line has it, without dashes.
-        content: texts, in lists and dicts.
-        folder: that of the file, in which further files are named.
-    """
+    """Names and import paths of classes in a config's content, each with the option that it stands for."""
     if isinstance(content, dict):
         for name, value in content.items():
             path = option if name in ("class_path", "init_args") else f"{option}.{name}".strip(".+")
@@ -86,7 +77,7 @@ def classes_in(option: str, content: Any, folder: Path) -> Iterator[tuple[str, s
 
 
 def fault_of(option: str, name: str) -> str:
-    """What is wrong with a class by its name or import path; empty if nothing is, or it is none of ours to say."""
+    """The fault of a class by its name or import path; empty if there is none, or the parser reports it."""
     if is_path(name):
         return import_fault(option, name)
     kinds = {**registry.COMPONENTS, "model": registry.model, "data": registry.corpus}
@@ -113,8 +104,8 @@ def import_fault(option: str, path: str) -> str:
     try:
         cls = vars(importlib.import_module(module)).get(name)
     except Exception as error:  # a module can fail in any way while it is imported
-        missing = getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None
-        return "" if missing and f"{module}.".startswith(f"{missing}.") else f"--{option} {path}: {place_of(error)}"
+        unknown = getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None
+        return "" if unknown and f"{module}.".startswith(f"{unknown}.") else f"--{option} {path}: {place_of(error)}"
     if cls is None and not module.startswith(("facediff.", "torch.", "lightning.")):
         classes = [n for n, value in vars(importlib.import_module(module)).items() if isinstance(value, type)]
         return f"--{option} {path}: {module} has no {name}: {choices(name, classes)}"
@@ -126,7 +117,7 @@ def place_of(error: BaseException) -> str:
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.filename}, line {error.lineno}: {error.msg}"
     frames = [frame for frame in traceback.extract_tb(error.__traceback__)[1:] if not frame.filename.startswith("<")]
-    own = [frame for frame in frames if "site-packages" not in frame.filename and frame.filename != importlib.__file__]
-    last = (own or frames)[-1:]
+    code = [frame for frame in frames if "site-packages" not in frame.filename and frame.filename != importlib.__file__]
+    last = (code or frames)[-1:]
     where = f"{last[0].filename}, line {last[0].lineno}: " if last else ""
     return f"{where}{type(error).__name__}: {' '.join(str(error).split())}"

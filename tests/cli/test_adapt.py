@@ -177,16 +177,6 @@ def test_what_cannot_work_is_said_before_training(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_vector_of_another_model_is_refused(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.save(tmp_path / "other.npy", np.zeros(7, np.float32))
-    soundfile.write(tmp_path / "speech.wav", np.random.default_rng(0).normal(0, 0.1, 16_000), 16_000)
-    words = ["--checkpoint", str(checkpoint), "--style", str(tmp_path / "other.npy"), "-o", str(tmp_path / "o.npy")]
-    assert main(["animate", str(tmp_path / "speech.wav"), *words]) == 2
-    assert "holds 7 numbers" in capsys.readouterr().err
-
-
 def person_folder(corpus: Path, root: Path, subject: str = "C", name: str = "Maria") -> Path:
     """The clips of a subject of the miniature corpus, as `facediff data import-person` lays out a person's."""
     for folder in ("wav", "vertices_npy"):

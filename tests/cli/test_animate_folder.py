@@ -15,11 +15,10 @@ import pytest
 import trimesh
 
 from facediff.animation import read_archive
-from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import load_model
-from facediff.pipelines.folder import LOCK, _deciding_files, _in_words, output_names, recordings, seed_of_recording
+from facediff.pipelines.folder import LOCK, output_names, recordings, seed_of_recording
 from facediff.utils.files import locked
 from tests.fakes.batches import run
 from tests.fakes.waiting import PATIENCE, wait_until, wait_until_signalled
@@ -61,21 +60,6 @@ def test_a_damaged_file_next_to_an_output_makes_it_again(folder: Path, capsys: p
         assert times(folder).pop("a.npy") != before.pop("a.npy")
         before = times(folder)
         assert "a.sound is missing or damaged" in capsys.readouterr().out
-
-
-def test_a_model_folder_may_hold_folders(tmp_path: Path) -> None:
-    (tmp_path / "model" / ".cache").mkdir(parents=True)
-    (tmp_path / "model" / "model.json").write_text("{}")
-    found = _deciding_files(AnimationOptions(checkpoint=tmp_path / "model"), ExportOptions())
-    assert found == [tmp_path / "model" / "model.json"]
-
-
-def test_large_arrays_are_told_apart_and_paths_stay_readable() -> None:
-    plain = np.zeros(2000)
-    other = plain.copy()
-    other[1000] = 1
-    assert _in_words(plain) == _in_words(plain.copy()) != _in_words(other)
-    assert _in_words(Path("a") / "b") == str(Path("a") / "b")
 
 
 def test_failures_of_all_kinds_stop_nothing_else(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -261,21 +245,6 @@ def test_workers_end_when_their_parent_is_killed(folder: Path, tmp_path: Path) -
     wait_until(lambda: not of_the_group())
     assert run(folder) == 0
     assert len(outputs(folder)) == 4
-
-
-def test_wrong_outputs_and_suffixes_of_a_batch_are_refused(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["animate", str(folder), "--checkpoint", str(tmp_path / "C.ckpt"), "-o"]
-    before = sorted(tmp_path.rglob("*"))
-    for more, sentence in (
-        ([str(tmp_path / "all.mp4")], "several recordings go into a folder; give its name, and --suffix .mp4"),
-        ([str(tmp_path / "out"), "--suffix", "x.glb"], "--suffix x.glb: there is no such format"),
-        ([str(tmp_path / "out"), "--suffix", "glb"], 'did you mean ".glb"?'),
-    ):
-        assert main([*words, *more]) == 2
-        assert sentence in capsys.readouterr().err
-    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.slow

@@ -37,12 +37,6 @@ def test_a_bad_config_is_refused_in_one_sentence(name: str, tmp_path: Path, caps
     assert printed.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["missing.yaml", "."])
-def test_a_config_that_is_no_file_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", "--config", name]) == 2
-    assert f"--config {name}" in capsys.readouterr().err
-
-
 def test_aliases_anchors_and_merges_may_be_used(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("base: &base {a: 1}\nmore:\n  <<: *base\n  <<: *base\n  b: [*base, *base]\n")
@@ -70,14 +64,6 @@ def test_tags_run_nothing(
     assert main(["fit", "--config", "mine.yaml"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "harm").exists()
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_plain_yaml_is_refused_for_the_same_reasons(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "plan.yaml"
-    path.write_bytes(BAD[name])
-    with pytest.raises(FaceDiffError, match=re.escape(str(path))):
-        load_yaml(path, "expected a plan")
 
 
 def test_plain_yaml_holds_numbers_and_texts_and_no_objects(tmp_path: Path) -> None:

@@ -67,8 +67,3 @@ def test_a_demo_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.M
             file.touch()
         assert main(["demo", "-o", str(tmp_path)]) == 2
     assert [words[-2:] == ["--ckpt_path", "last"] for words in asked] == [False, True, False]
-
-
-def test_fast_and_epochs_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", "--fast", "--epochs", "3"]) == 2
-    assert "--fast" in capsys.readouterr().err

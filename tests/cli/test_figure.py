@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import re
-import shlex
 import shutil
 from pathlib import Path
 
@@ -13,7 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from facediff.cli.app import COMMANDS, load, main
+from facediff.cli.app import load, main
 from facediff.cli.options import named_folders
 from facediff.cli.parsing import arguments_of
 from facediff.errors import FaceDiffError
@@ -139,17 +136,6 @@ def test_lengths_that_differ_are_noted(corpus: Path, capsys: pytest.CaptureFixtu
     assert "ours lasts from 0 to 0.36 s" in capsys.readouterr().err
 
 
-def test_values_that_cannot_be_drawn_are_noted(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = corpus.parent / "run" / "metrics.csv"
-    table.write_text("epoch,step,train/loss\n0,0,nan\n0,1,inf\n0,2,-1\n0,3,2\n")
-    assert main(words("training", corpus)) == 0
-    printed = capsys.readouterr().out
-    assert "note: one: 2 of 4 values of train/loss are NaN or infinity and not drawn\n" in printed
-    assert main(words("training", corpus, "--log")) == 0
-    printed = capsys.readouterr().out
-    assert "note: two: 3 of 4 values of train/loss are NaN, infinity or not above 0 and not drawn\n" in printed
-
-
 def test_what_does_not_fit_is_one_sentence(
     corpus: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,19 +166,6 @@ def test_what_does_not_fit_is_one_sentence(
     assert sorted(corpus.parent.rglob("*")) == before
 
 
-def test_missing_pieces_of_a_corpus(corpus: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (corpus / "regions" / "inner_lip_pairs.txt").unlink()
-    shutil.rmtree(corpus / "phonemes")
-    (corpus / "templates.pkl").write_bytes(pickle.dumps({"B": np.zeros((VERTICES, 3))}))
-    for figure, message in (
-        ("lips", "inner_lip_pairs.txt: no such file; give --lip-pairs"),
-        ("frames", "give --phoneme-file"),
-        ("heatmap", "no template of A, needed by clip A_e06; give --templates FILE"),
-    ):
-        assert main(words(figure, corpus)) == 2
-        assert message in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("drawn", [0, 42])
 def test_the_built_in_corpus_by_name(
     drawn: int, corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -216,18 +189,3 @@ def test_folders_by_name(tmp_path: Path) -> None:
     for word in ("=y", "x="):
         with pytest.raises(FaceDiffError, match="NAME=FOLDER"):
             named_folders([word], lambda path: path.name)
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/figures.md"])
-def test_documented_commands_parse(page: str) -> None:
-    lines = re.findall(
-        r"^(?:\$ )?facediff figure (?!FIGURE)(.*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE
-    )
-    assert lines
-    for line in lines:
-        figure, *rest = shlex.split(line)
-        assert arguments_of(load(f"figure {figure}"), "", rest)["page"].output
-    if page != "README.md":
-        assert {shlex.split(line)[0] for line in lines} == {
-            name.split()[1] for name in COMMANDS if name.startswith("figure ")
-        }

@@ -156,13 +156,6 @@ def test_the_last_checkpoint_is_the_newest_runs(
         os.utime(tmp_path / "puppet" / f"version_{version}", (time.time() + 60,) * 2)
 
 
-def test_flags_that_would_change_a_checkpoints_model_are_refused(
-    checkpoint: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["test", "--ckpt_path", str(checkpoint), "--model.dim=32"]) == 2
-    assert "decides the model" in capsys.readouterr().err
-
-
 def test_a_wrong_name_lists_the_right_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of models, corpora and components, on the command line and in a file."""
     (tmp_path / "own.yaml").write_text("model: {init_args: {decoder: {class_path: grru}}}\n")
@@ -287,17 +280,6 @@ def test_runs_carry_the_name_of_their_experiment(
     logger = print_config(*words, capsys=capsys)["trainer"]["logger"]  # type: ignore[index]
     first = logger[0] if isinstance(logger, list) else logger
     assert first["init_args"]["name"] == expected
-
-
-def test_the_quick_experiments_use_every_corpus_and_trainer() -> None:
-    """Which files a config names, those that its files name included."""
-
-    def named(path: Path) -> set[str]:
-        paths = {(path.parent / name).resolve() for name in re.findall(r"[\w./]+\.yaml", path.read_text())}
-        return {str(path)}.union(*map(named, paths))
-
-    parts = [named(CONFIGS / "experiment" / f"{name}.yaml") for name in QUICK]
-    assert {path.stem for path in (CONFIGS / "data").iterdir()} <= {Path(p).stem for p in set().union(*parts)}
 
 
 def test_configs_are_short() -> None:
@@ -426,16 +408,6 @@ def test_freed_memory_is_kept_for_the_next_step() -> None:
     before, told, _, after = done.stdout.split()
     if told == "True":  # another C library has nothing to be told
         assert int(after) < 0.01 * int(before)
-
-
-@pytest.mark.parametrize("value", ["${nope.x}", "${oc.env:FACEDIFF_NOT_SET}"])
-def test_an_interpolation_that_cannot_be_resolved_names_its_option(
-    value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("FACEDIFF_TRACEBACK")
-    (tmp_path / "mine.yaml").write_text(f"model: {{class_path: DualPathDiffusion, init_args: {{dim: '{value}'}}}}\n")
-    assert main(["fit", "--config", str(tmp_path / "mine.yaml"), "--data=Puppet"]) == 2
-    assert "model.init_args.dim" in capsys.readouterr().err
 
 
 def test_loggers_that_another_config_replaces_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

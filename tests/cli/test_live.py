@@ -77,22 +77,6 @@ def test_live_knows_how_late_a_models_own_windows_are(method: str, tmp_path: Pat
     assert hops[-1] / model.frame_rate == pytest.approx(model.hop)
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--threads", "2"], "--threads"),
-        (["--identity", "Z"], "Z"),
-        (["--window", "0.1"], "window"),
-    ],
-)
-def test_options_that_a_trained_model_does_not_take(
-    words: list[str], named: str, checkpoint: Path, speech: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["live", str(checkpoint), str(speech), "--to", "jsonl:-?weights=false", "--quiet", *words]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert named in line
-
-
 @pytest.mark.slow
 def test_interrupt_ends_with_the_report_and_status_0(checkpoint: Path, tmp_path: Path) -> None:
     """In a real process that waits for samples, with a file that appears whole."""

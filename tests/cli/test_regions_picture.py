@@ -57,16 +57,6 @@ def test_other_sources_and_repeated_indices(root: Path, tmp_path: Path, capsys: 
     assert "from mine.txt, 2 repeated indices counted once" in printed
 
 
-def test_what_is_missing_is_named_and_nothing_written(root: Path, tmp_path: Path) -> None:
-    (root / "regions" / "lve.txt").write_text("1, 24")
-    with pytest.raises(FaceDiffError, match="24 vertices ends at 23"):
-        run("data regions", [str(root), "-o", str(tmp_path / "regions.png"), *TINY])
-    (root / "tiny.ply").unlink()
-    with pytest.raises(FaceDiffError, match=r"put tiny\.ply into this folder"):
-        run("data regions", [str(root), "-o", str(tmp_path / "regions.png"), *TINY])
-    assert not list(tmp_path.glob("*.*"))
-
-
 def test_a_folder_that_is_no_corpus(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match="not recognised.*--corpus"):
         run("data regions", [str(tmp_path), "-o", str(tmp_path / "regions.png")])

@@ -81,7 +81,7 @@ def as_z_up(points: np.ndarray) -> np.ndarray:
     return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
 
 
-UPRIGHT = "the target mesh has z up and is turned: what is written has y up"
+UPRIGHT = "the target mesh has z up and is turned: the written file has y up"
 
 
 @pytest.mark.parametrize("tilt", [0, 15, 90])
@@ -92,7 +92,7 @@ def test_only_a_mesh_with_z_up_is_set_upright(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A head may look up a little; one that lies on its side is nobody's axes."""
+    """A head may look up a little; one that lies on its side has no axes of its own."""
     monkeypatch.chdir(tmp_path)
     turn = trimesh.transformations.rotation_matrix(np.deg2rad(tilt), [0, 1, 0])[:3, :3]
     write_obj(tmp_path / "z.obj", 1000 * as_z_up(animation.template) @ turn.T, animation.triangles)
@@ -100,7 +100,7 @@ def test_only_a_mesh_with_z_up_is_set_upright(
     assert main(["retarget", "take.npz", "--target-mesh", "z.obj", "-o", "out.npz"]) == 0
     said, goal = capsys.readouterr().out, as_z_up(1000 * swaying.vertices) @ turn.T
     upright = read_archive(tmp_path / "out.npz")
-    assert (UPRIGHT in said, "so is what is written" in said) == (tilt < 20, tilt > 20)
+    assert (UPRIGHT in said, "so is the written file" in said) == (tilt < 20, tilt > 20)
     moved = upright.vertices if tilt > 20 else as_z_up(upright.vertices)
     assert np.abs(moved - goal).max() < 0.01
     assert np.abs(upright.still().vertices[0] - upright.template).max() < 0.01, "the head's motion turns with its face"
@@ -114,7 +114,7 @@ def test_files_that_may_have_z_up_fit_a_mesh_that_has(
     write_obj(tmp_path / "z.obj", rest, animation.triangles)
     words = ["retarget", "take.npz", "--target-mesh", "z.obj", "--correspondence", "map.npz", "-o"]
     assert main([*words, "out.pc2"]) == 0
-    assert "the target mesh has z up, and so has what is written" in capsys.readouterr().out
+    assert "the target mesh has z up, and so has the written file" in capsys.readouterr().out
     cache = np.frombuffer((tmp_path / "out.pc2").read_bytes()[32:], "<f4").reshape(moved.shape)
     assert np.abs(cache - moved).max() < 0.01
     assert " z up" in (tmp_path / "out.obj").read_text().splitlines()[0]
@@ -133,7 +133,7 @@ def test_a_glb_with_z_up_keeps_its_axes(
     trimesh.Trimesh(as_z_up(animation.template), animation.triangles, process=False).export("z.glb")
     words = ["retarget", "take.npz", "--target-mesh", "z.glb", "-o", "own.glb", "--add-to-mesh"]
     assert main(words) == 0
-    assert "so is what is written" in capsys.readouterr().out
+    assert "so is the written file" in capsys.readouterr().out
     glb = open_glb(tmp_path / "own.glb")
     (part,) = glb.primitives(0)
     targets = np.stack([glb.numbers(target["POSITION"], "VEC3", ("f4",)) for target in part["targets"]])
