@@ -65,12 +65,13 @@ def build(folder: Path) -> dict[str, str]:
 
 
 def problems_of_wheel(path: Path) -> list[str]:
-    """What a wheel holds that it must not, or lacks."""
+    """Foreign and missing files of a wheel."""
     with zipfile.ZipFile(path) as wheel:
         names = wheel.namelist()
     strange = [name for name in names if not name.startswith(("facediff/", "facediff-"))]
     strange += [name for name in names if "__pycache__" in name or name.startswith("facediff/tests")]
-    needed = {"facediff/py.typed", "facediff/bundled/puppet/model.json", "facediff/configs/experiment/puppet.yaml"} | {"facediff/examples/speech.wav"}
+    inside = ("py.typed", "bundled/puppet/model.json", "configs/experiment/puppet.yaml", "examples/speech.wav")
+    needed = {f"facediff/{name}" for name in inside}
     problems = [f"holds {name}" for name in strange] + [f"lacks {name}" for name in sorted(needed - set(names))]
     if path.stat().st_size > LARGEST:
         problems.append(f"is {path.stat().st_size / 2**20:.1f} MB, more than {LARGEST / 2**20:.0f}")
