@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 
@@ -42,6 +42,20 @@ def choices(name: str, candidates: Iterable[str]) -> str:
         near = difflib.get_close_matches(name, names, n=5, cutoff=0.3)
         return f"{hint}the nearest of {len(names)} are {', '.join(near)}"
     return f"{hint}known are {', '.join(names)}"
+
+
+def check_known(source: object, kind: str, names: Iterable[str], candidates: Collection[str]) -> None:
+    """Refuse names that are none of the candidates.
+
+    Args:
+        source: file or option that has the names.
+        kind: noun for them, such as "corpus".
+        names: to check.
+        candidates: known names.
+    """
+    for name in names:
+        if name not in candidates:
+            raise FaceDiffError(f'{source}: there is no {kind} "{name}": {choices(name, candidates)}')
 
 
 def lacking(cls: object) -> str:

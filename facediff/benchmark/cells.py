@@ -24,10 +24,9 @@ from facediff.benchmark.plan import (
     MethodEntry,
     Options,
     Variant,
-    check_names,
     find_config,
 )
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, check_known
 from facediff.utils.checksums import describe_files, sha256
 from facediff.utils.files import short_name
 from facediff.utils.hub import check_model_source, model_hash
@@ -145,7 +144,7 @@ def rows_of(plan: BenchmarkPlan) -> list[Row]:
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
         raise FaceDiffError(f"{plan.file}: {repeated} names two rows; rename the method or the variant")
-    check_names(f"{plan.file}: baseline", "row", filter(None, [plan.baseline.removesuffix(MEAN_SUFFIX)]), names)
+    check_known(f"{plan.file}: baseline", "row", filter(None, [plan.baseline.removesuffix(MEAN_SUFFIX)]), names)
     return rows
 
 

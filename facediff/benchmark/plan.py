@@ -6,12 +6,12 @@ It names experiment configs, checkpoints, and folders of predictions, none of wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known, choices
 from facediff.utils.files import config_dir
 from facediff.utils.ranges import Range
 from facediff.utils.records import DERIVED, Items, Text, read_record
@@ -178,7 +178,7 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkP
         roots: folders of corpora by the plan's names, which override the plan's.
     """
     plan = read_record(BenchmarkPlan, load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path)
-    check_names("--root", "corpus", roots or {}, plan.corpora)
+    check_known("--root", "corpus", roots or {}, plan.corpora)
     return replace(
         plan,
         name=path.stem,
@@ -190,13 +190,6 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkP
             name: replace(variant, name=name, label=variant.label or name) for name, variant in plan.variants.items()
         },
     )
-
-
-def check_names(source: object, kind: str, names: Iterable[str], candidates: Collection[str]) -> None:
-    """Refuse names in a plan that are none of the candidates."""
-    for name in names:
-        if name not in candidates:
-            raise FaceDiffError(f"{source}: there is no {kind} {name!r}: {choices(name, candidates)}")
 
 
 def _corpus(name: str, corpus: CorpusEntry, root: Path | None, path: Path) -> CorpusEntry:
@@ -216,8 +209,8 @@ def _corpus(name: str, corpus: CorpusEntry, root: Path | None, path: Path) -> Co
 def _method(name: str, method: MethodEntry, plan: BenchmarkPlan, path: Path) -> MethodEntry:
     """The method, after a check of its files and names."""
     entry = f"{path}: methods.{name}"
-    check_names(f"{entry}.corpora", "corpus", method.corpora or (), plan.corpora)
-    check_names(f"{entry}.variants", "variant", method.variants or (), plan.variants)
+    check_known(f"{entry}.corpora", "corpus", method.corpora or (), plan.corpora)
+    check_known(f"{entry}.variants", "variant", method.variants or (), plan.variants)
     per_seed = method.config is not None or "{seed}" in f"{method.checkpoint} {method.predictions}"
     problem = ""
     if [method.config, method.checkpoint, method.predictions].count(None) != 2:
@@ -246,12 +239,12 @@ def check_scores(plan: BenchmarkPlan) -> None:
         parse_all(plan.metrics)
     except FaceDiffError as error:
         raise FaceDiffError(f"{plan.file}: {error}") from error
-    check_names(f"{plan.file}: published", "table", plan.published, published())
+    check_known(f"{plan.file}: published", "table", plan.published, published())
     scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *plan.metrics, *SMOOTHNESS, *COSTS]
     # A metric of several scores gives each its own name behind.
     prefixes = tuple(f"{name}_" for name in plan.metrics)
     columns = [column for column in plan.columns if not column.startswith(prefixes)]
-    check_names(f"{plan.file}: columns", "score", columns, scores)
+    check_known(f"{plan.file}: columns", "score", columns, scores)
 
 
 def _beside(plan: Path, text: str) -> Path:

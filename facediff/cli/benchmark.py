@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from facediff.cli.options import OutputFolder, Scheduler, Seed, Workers
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, choices, counted
+from facediff.errors import FaceDiffError, check_known, counted
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -128,9 +128,8 @@ def report(
     from facediff.benchmark.plan import MEAN_SUFFIX
 
     for folder in folders:
-        rows = read_outline(folder).rows
-        if baseline is not None and baseline.removesuffix(MEAN_SUFFIX) not in rows:
-            raise FaceDiffError(f"--baseline {baseline}: {folder} has no such row: {choices(baseline, rows)}")
+        rows = [row + suffix for row in read_outline(folder).rows for suffix in ("", MEAN_SUFFIX)]
+        check_known(f"--baseline: {folder}", "row", [baseline] if baseline else [], rows)
     for folder in folders:
         written = write_and_tell(folder, baseline, bootstrap, level, seed, output)
         if page is not None:

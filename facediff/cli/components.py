@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.cli.parsing import plain_text
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import check_known
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -24,8 +24,7 @@ def components(kind: Annotated[str | None, Option(metavar="KIND")] = None, *, js
     """
     from facediff.registry import KINDS
 
-    if kind is not None and kind not in KINDS:
-        raise FaceDiffError(f'there is no kind "{kind}": {choices(kind, KINDS)}')
+    check_known("components", "kind", [kind] if kind else [], KINDS)
     kinds = [entry_kind for entry_kind in KINDS.values() if kind in (None, entry_kind.kind)]
     bundled = bundled_models() if kind in (None, "model") else []
     if json:

@@ -18,7 +18,7 @@ from facediff.cli.options import Corpus, File, FileOrList, FrameRate, OutputFold
 from facediff.cli.parsing import Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.data import prepare as prepare_package
-from facediff.errors import FaceDiffError, choices, counted, printable
+from facediff.errors import FaceDiffError, check_known, counted, printable
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -133,8 +133,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
         tell(*PREPARE.format(corpora=", ".join(CORPORA)).split("\n"))
         return 0 if arguments else 2
     corpus, *remaining = arguments
-    if corpus not in CORPORA:
-        raise FaceDiffError(f'there is no corpus "{corpus}" to prepare: {choices(corpus, CORPORA)}')
+    check_known("data prepare", "corpus", [corpus], CORPORA)
     module = importlib.import_module(f"facediff.data.prepare.{corpus}")
     title = (module.__doc__ or "").partition("\n")[0]
     values = parse(options_of(module.plan), remaining, f"facediff data prepare {corpus}", title)

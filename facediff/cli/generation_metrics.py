@@ -12,7 +12,7 @@ from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder, prepared
 from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
+from facediff.errors import check_known
 from facediff.utils import ranges
 from facediff.utils.hub import check_model_source
 from facediff.utils.option import Option
@@ -92,9 +92,7 @@ def generation_metrics(
     """
     for path in [*checkpoints, *([] if against is None else [against])]:
         check_model_source(path)
-    for name in splits or ():
-        if name not in SPLITS:
-            raise FaceDiffError(f"--splits {name}: there is no such split; expected one of {', '.join(SPLITS)}")
+    check_known("--splits", "split", splits or (), SPLITS)
     stored = None
     if against is not None and against.suffix.lower() == ".json":
         from facediff.utils.plain_files import load_json

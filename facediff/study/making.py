@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices, counted
+from facediff.errors import FaceDiffError, check_known, counted
 from facediff.render import Camera, Renderer, side_by_side, write_video
 from facediff.study.definition import DATABASE, PAGE_FOLDER, STUDY_FILE, VIDEO_FOLDER, Study, Trial
 from facediff.study.design import STILL, TRUTH, Showing, make_forms, make_pairs, make_schedules
@@ -267,9 +267,7 @@ def choose_references(
 def choose_clips(material: StudyAnimations, options: StudyOptions) -> list[str]:
     """The clips of the options, or a seeded choice, evenly among the speakers."""
     if options.clips is not None:
-        for name in options.clips:
-            if name not in material.clips:
-                raise FaceDiffError(f'--clips: not all have a clip "{name}": {choices(name, material.clips)}')
+        check_known("--clips", "common clip", options.clips, material.clips)
         return list(dict.fromkeys(options.clips))
     rng = np.random.default_rng([options.seed, 0])
     by_subject: dict[str, list[str]] = {}

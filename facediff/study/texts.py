@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.study.definition import Name, Question, Rule, Texts
 from facediff.utils.plain_files import parse_json
 from facediff.utils.records import read_record
@@ -41,9 +41,7 @@ def bundled_texts() -> dict[str, dict[str, Any]]:
 def check_languages(languages: Sequence[str] | None) -> list[str]:
     """The languages of a study; all bundled ones if None."""
     bundled = bundled_texts()
-    for language in languages or ():
-        if language not in bundled:
-            raise FaceDiffError(f'--languages: there are no texts in "{language}": {choices(language, bundled)}')
+    check_known("--languages", "language", languages or (), bundled)
     return list(languages or bundled)
 
 

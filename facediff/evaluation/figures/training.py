@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.evaluation.figures.material import Array
 from facediff.evaluation.figures.page import PANEL_HEIGHT, Paper, check_output, legend_columns, new_figure, save, style
 from facediff.reporting.drawing import SMALLEST_TEXT, line_style, plain
@@ -80,9 +80,7 @@ def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[st
     defaults = [name for name in USUAL_SCALARS if all(name in curves for curves in runs.values())]
     scalars = scalars or defaults or USUAL_SCALARS
     for run, curves in runs.items():
-        for name in scalars:
-            if name not in curves:
-                raise FaceDiffError(f'{run}: logged no scalar "{name}"; choose with --scalar: {choices(name, curves)}')
+        check_known(f"--scalar: {run}", "scalar", scalars, curves)
     return list(dict.fromkeys(scalars))
 
 

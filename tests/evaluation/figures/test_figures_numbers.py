@@ -85,7 +85,7 @@ def test_curves_of_a_run(tmp_path: Path) -> None:
     np.testing.assert_array_equal(by_epoch["train/loss"].values, [2, np.nan])  # the epoch's last
     runs = {"one": curves, "two": curves}
     assert choose_scalars(runs, None) == ["train/loss", "val/lve"]
-    with pytest.raises(FaceDiffError, match=r'one: logged no scalar "val/lvee".*did you mean "val/lve"'):
+    with pytest.raises(FaceDiffError, match=r'--scalar: one: there is no scalar "val/lvee".*did you mean "val/lve"'):
         choose_scalars(runs, ["val/lvee"])
     with pytest.raises(FaceDiffError, match="choose with --scalar: known are lr"):
         choose_scalars({"one": {"lr": curves["lr"]}}, None)
