@@ -1,4 +1,4 @@
-"""Tables that anyone can regenerate: plans of methods, corpora and seeds, their cells, and what the results say."""
+"""Tables that anyone can regenerate: plans of methods, corpora and seeds, their cells and results."""
 
 from facediff.benchmark.cells import Cell, cells_of, rows_of
 from facediff.benchmark.outline import ReportOutline

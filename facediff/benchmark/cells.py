@@ -59,7 +59,7 @@ class Cell:
         corpus: the plan's name of the corpus.
         seed: of the training; None where the plan does not train.
         kind: whether it is trained, or a checkpoint, or predictions.
-        trainings: what is trained, in this order.
+        trainings: in this order.
         source: the checkpoint, or the folder of predictions.
         options: of ``facediff evaluate``, for predictions.
         test_options: of ``facediff test``.
@@ -107,7 +107,7 @@ class Cell:
 
 
 def hash_of(content: object) -> str:
-    """SHA-256 of plain data, whatever the order of its keys."""
+    """SHA-256 of plain data with sorted keys."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 

@@ -274,7 +274,7 @@ def curve_of(path: Path) -> dict[str, list[float | None]]:
     if not path.is_file():
         return {}
     by_step: dict[float, dict[str, float]] = {}
-    for row in read_rows(path, remedy="expected what CSVLogger writes during training"):
+    for row in read_rows(path, remedy="expected a metrics.csv of CSVLogger"):
         values = {name: float(row[name]) for name in CURVES if row.get(name)}
         if values and row.get("step"):
             by_step.setdefault(float(row["step"]) + 1, {}).update(values)

@@ -191,7 +191,7 @@ class Runner:
         else:
             self.measured[training.name] = {key: state.get(key) for key in ("seconds", "memory")}
         checkpoint = best if self.setting.weights == "best" else last
-        if not checkpoint.is_file() and training != cell.trainings[-1]:  # only what is scored has to have a best one
+        if not checkpoint.is_file() and training != cell.trainings[-1]:  # only the scored model needs a best one
             checkpoint = last
         if not checkpoint.is_file():
             raise FaceDiffError(

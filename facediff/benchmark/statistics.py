@@ -127,10 +127,10 @@ def in_both(one: RowScores, two: RowScores) -> tuple[ScoreMatrix, ScoreMatrix] |
 def both_chances(gaps: Array, runs: Sequence[Array], level: float = 0.95) -> tuple[float | None, Interval | None]:
     """Student's t-test of a difference by which both sentences and training runs are chance, and its interval.
 
-    What is common to a run and a sentence is in both variances, so the test errs on the safe side.
+    The common part of a run and a sentence is in both variances, so the test errs on the safe side.
 
     Args:
-        gaps: what each sentence adds to the difference (sentences,).
+        gaps: contributions of sentences to the difference (sentences,).
         runs: the score of each training run (runs,), for each of the rows that were trained.
         level: of the interval.
 
@@ -219,7 +219,7 @@ def marked(rows: Mapping[str, RowScores], better: str | None, bootstrap: Bootstr
     Args:
         rows: scores by row, without the reference rows.
         better: ``lower`` or ``higher``; with another value nothing is marked, since no direction is the better one.
-        bootstrap: its level decides what is significant.
+        bootstrap: its level is that of significance.
     """
     if better not in ("lower", "higher") or len(rows) < 2:
         return {}

@@ -32,7 +32,7 @@ SPLIT_LABELS = {
 
 @dataclass(frozen=True)
 class Cost:
-    """What a row costs, mean over its runs."""
+    """Costs of a row, mean over its runs."""
 
     parameters: int | None = None
     factor: float | None = None  # real-time factor: seconds of computing for a second of speech

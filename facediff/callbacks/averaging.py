@@ -45,7 +45,7 @@ class EmaWithWarmup(WeightAveraging):
         super().__init__(device=device, use_buffers=False, multi_avg_fn=self.average)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Copy the model, whole: its own set-up, where it would make what the corpus decides, comes later."""
+        """Copy the whole model; its own set-up by the corpus comes later."""
         data = getattr(trainer, "datamodule", None)
         if stage == "fit" and isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
             pl_module.make_parts(data.assets())

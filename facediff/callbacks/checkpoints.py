@@ -390,7 +390,7 @@ def requeue_on_signal(trainer: Trainer) -> None:
     """Have SIGUSR1 end a job of SLURM and start it again where :class:`LastCheckpoint` does not take it.
 
     Lightning would write ``hpc_ckpt_1.ckpt`` into the working folder and go on; under SLURM, every later training in
-    that folder begins from this file, whatever it trains. The trainer must be made with :func:`slurm_plugins`.
+    that folder begins from this file. The trainer must be made with :func:`slurm_plugins`.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -404,7 +404,7 @@ def requeue_on_signal(trainer: Trainer) -> None:
 
 
 def slurm_plugins(plugins: object = None) -> list[Any]:
-    """The plug-ins of a trainer with what it needs in a job of SLURM, so that Lightning leaves SIGUSR1 alone."""
+    """The plug-ins of a trainer in a job of SLURM, with which Lightning leaves SIGUSR1 alone."""
     stated = [] if plugins is None else plugins if isinstance(plugins, list) else [plugins]
     for plugin in stated:
         if isinstance(plugin, SLURMEnvironment):
@@ -431,7 +431,7 @@ def counted(monitor: ThroughputMonitor) -> list[float]:
 
 
 def continue_counting(trainer: Trainer, counts: list[list[float]]) -> None:
-    """Let the monitors count on from what they had counted when the checkpoint was written."""
+    """Set the monitors' counts to their values in the checkpoint."""
     for monitor, counters in zip(throughput_monitors(trainer), counts, strict=False):
         if counted(monitor) and counters:
             samples, batches, *_, seconds = counters  # 1.x has a third counter

@@ -123,7 +123,7 @@ class SamplingPreview(Callback):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The error scale and what has been drawn, so that a resumed run continues with both."""
+        """The error scale and the drawn previews, so that a resumed run continues with both."""
         return {"error_scale": self._scale, "drawn_epochs": self._drawn_epochs, "drawn_step": self._drawn_step}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -147,7 +147,7 @@ class SamplingPreview(Callback):
         # DeepSpeed's strategy is a DDPStrategy, but spreads the weights over processes like FSDP.
         sharded = isinstance(trainer.strategy, DeepSpeedStrategy) or not isinstance(trainer.strategy, DDPStrategy)
         if model.assets.scored.faces is None:
-            if trainer.is_global_zero:  # no fault: the bundled configs ask for previews, whatever the corpus has
+            if trainer.is_global_zero:  # no fault: the bundled configs ask for previews of any corpus
                 files = " or ".join(data.mesh_files) or "its class names no mesh_files"
                 print(f"no previews in this run: {data.root} holds no mesh to draw ({files})", flush=True)
         elif trainer.world_size > 1 and sharded:
@@ -175,7 +175,7 @@ class SamplingPreview(Callback):
             self._preview(trainer, pl_module, epochs)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the last weights, averaged ones if there are any, in whatever order the callbacks stand."""
+        """Draw the last weights, averaged ones if there are any, in any order of the callbacks."""
         if self.at_end and self._drawn_step != trainer.global_step:
             self._preview(trainer, pl_module, trainer.current_epoch, averaged_weights(trainer, pl_module))
 
@@ -225,7 +225,7 @@ class SamplingPreview(Callback):
         return draw_clip(model, sample, motion, folder, epochs, error_scale=scale, size=self.size, view=self.view)
 
     @contextmanager
-    def _surviving(self, what: str) -> Iterator[None]:
+    def _surviving(self, step: str) -> Iterator[None]:
         """Turn an error into a warning; one that will come again each time ends the previews."""
         try:
             yield
@@ -234,7 +234,7 @@ class SamplingPreview(Callback):
             warnings.warn(f"no previews in this run: {error}", stacklevel=4)
         except Exception as error:
             reason = str(error) or type(error).__name__
-            warnings.warn(f"the preview {what} failed, and training goes on: {reason}", stacklevel=4)
+            warnings.warn(f"the preview {step} failed, and training goes on: {reason}", stacklevel=4)
 
     def _warn(self, trainer: Trainer, why: str) -> None:
         if trainer.is_global_zero:

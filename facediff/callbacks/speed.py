@@ -75,7 +75,7 @@ class CompiledTraining(Callback):
 
     Args:
         parts: names of submodules of the model's network, such as ``decoder`` or ``style_encoder``.
-        backend: what compiles, as ``torch.compile`` calls it. The usual one needs a C++ compiler on a processor, and
+        backend: of ``torch.compile``. The usual one needs a C++ compiler on a processor, and
             Triton and a C compiler on a GPU.
     """
 

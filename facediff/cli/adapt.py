@@ -63,7 +63,7 @@ class EncoderOptions:
             docs/voices.md); --low-latency does not unless it is given
         transcribed: with --voices, of a model of the built-in corpus: folder of people's recordings, NAME.wav or .flac
             of up to 15 s, each with its words in NAME.txt, or in NAME.de.txt if they are German
-        interpolation: how far the audio encoder's weights go from what they were to what was distilled (0.85 with
+        interpolation: share of the distilled weights in the audio encoder's (0.85 with
             --voices, 1 with --low-latency): less changes clean speech less
     """
 

@@ -89,7 +89,7 @@ COMMANDS = {
     ),
     "benchmark referee": Command(
         "facediff.cli.referee:referee",
-        "compare models of any kind on one face, by what phonemes ask of it",
+        "compare models of any kind on one face, by phonemes",
         "train,puppet",
     ),
     "generation-metrics": Command(
@@ -104,12 +104,12 @@ COMMANDS = {
     "study make": Command(
         "facediff.cli.study:make", "make a user study: videos side by side and a page of questions", "study"
     ),
-    "study serve": Command("facediff.cli.study:serve", "serve a study's page, and store what raters answer", "study"),
+    "study serve": Command("facediff.cli.study:serve", "serve a study's page, and store the answers", "study"),
     "study report": Command(
         "facediff.cli.study:report", "analyse the answers: preference, scores, agreement; plan", "study"
     ),
     "data prepare": Command("facediff.cli.data:run", "make a corpus folder from a raw distribution", "prepare"),
-    "data check": Command("facediff.cli.data:check", "recognise a folder, and report what is missing or wrong in it"),
+    "data check": Command("facediff.cli.data:check", "recognise a folder, and report missing and wrong parts"),
     "data pack": Command("facediff.cli.data:pack", "pack a corpus, for object storage and small disks", "packed"),
     "data unpack": Command("facediff.cli.data:unpack", "write the corpus folder that a packed corpus holds", "packed"),
     "data regions": Command("facediff.cli.data:regions", "draw a corpus's lips and upper face on its mesh"),
@@ -122,7 +122,7 @@ COMMANDS = {
     "data import-person": Command(
         "facediff.cli.data:import_person", "make a reconstructed video a corpus entry", "prepare"
     ),
-    "components": Command("facediff.cli.components:components", "list what can be chosen by name"),
+    "components": Command("facediff.cli.components:components", "list components and other names to choose from"),
     "check-install": Command(
         "facediff.cli.check_install:check_install", "print versions, devices and extras, and try the bundled model"
     ),

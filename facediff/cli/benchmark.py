@@ -51,7 +51,7 @@ def benchmark(
         workers: cells at a time (default: the plan's, or as many as processors allow)
         scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
         retry_failed: try cells again that failed
-        dry_run: say what would run, and for how long by the last timings
+        dry_run: list the cells that would run, with times by the last timings
     """
     from facediff.benchmark.plan import check_scores, find_plan, read_plan
     from facediff.utils.jobs import is_cluster
@@ -84,12 +84,12 @@ def benchmark(
         with closing(run_cells(left, setting, workers=count, scheduler=scheduler)) as outcomes:
             for number, (cell, outcome) in enumerate(outcomes, 1):
                 failed += bool(outcome.problem)
-                what = outcome.problem or f"{cell}: {outcome.seconds:.0f} s"
-                tell(f"[{number}/{len(left)}] {what}")
+                outcome_text = outcome.problem or f"{cell}: {outcome.seconds:.0f} s"
+                tell(f"[{number}/{len(left)}] {outcome_text}")
         results, _ = read_results(folder, outline)
         old = sum(1 for result in results if result.problem) - failed
         if old:
-            tell(f"{counted(old, 'cell')} had failed before; --retry-failed runs what failed again")
+            tell(f"{counted(old, 'cell')} had failed before; --retry-failed runs them again")
         if all(result.problem for result in results):
             raise FaceDiffError(f"every cell failed, the first: {next(result.problem for result in results)}")
         write_and_tell(folder, None, RESAMPLES, 0.95, 0, None)
@@ -157,7 +157,7 @@ def announce(
     seconds: Mapping[Cell, float | None],
     workers: int | None,
 ) -> None:
-    """Say what will run, and for how long."""
+    """List the cells that will run, with times."""
     from facediff.utils.tables import format_table
 
     at_a_time = f"{workers} at a time" if workers else "one on each worker at a time"

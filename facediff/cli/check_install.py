@@ -86,7 +86,7 @@ def version_of(package: str) -> str | None:
 
 
 def devices(with_torch: bool) -> str:
-    """Processors, and what PyTorch can compute on besides them."""
+    """Processors, and PyTorch's other devices."""
     processors = f"{os.cpu_count()} processors ({platform.machine()})"
     if not with_torch:
         return f"{processors}; graphics cards are used by PyTorch only, which is not installed"

@@ -114,7 +114,7 @@ def guard_configs(mode: str) -> None:
             try:
                 check_yaml(text, "--config")
             except FaceDiffError as error:
-                if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries what else it may be
+                if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries other types
                     raise error.__cause__ from error
                 raise
         return with_paths(without_removed_options(with_bundled(read(text)), "--config"))

@@ -138,7 +138,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     title = (module.__doc__ or "").partition("\n")[0]
     values = parse(options_of(module.plan), remaining, f"facediff data prepare {corpus}", title)
     raw, out, work = values.pop("raw"), values.pop("out"), values.pop("work")
-    if out.resolve().is_relative_to(raw.resolve()):  # the next run would read what is written as raw data
+    if out.resolve().is_relative_to(raw.resolve()):  # the next run would read the output as raw data
         raise FaceDiffError(f"{out}: lies in the raw folder {raw}; choose a folder outside it to write to")
     if "quiet" in inspect.signature(module.plan).parameters:  # a long scan has a progress bar
         values["quiet"] = work.quiet

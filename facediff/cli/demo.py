@@ -135,7 +135,7 @@ def write_sheet(path: Path, animations: Sequence[Animation], footer: str = "") -
 
 
 def compare_with_bundled(checkpoint: Path, data: SpeechMotionDataModule) -> list[str]:
-    """Lip vertex errors of what ``facediff animate`` gives with the new and the bundled model, in a line a test split.
+    """Lip vertex errors of ``facediff animate`` with the new and the bundled model, in a line a test split.
 
     They are shares of a still face's error, over the same clips; both models choose the style by themselves.
     """

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from facediff.evaluation import EvaluationReport
     from facediff.evaluation.parameters import ParameterFiles
 
-DRAW_SECONDS = 4e-8  # What a resample takes for each clip
+DRAW_SECONDS = 4e-8  # A resample for each clip
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class MotionOptions:
         n_vertices: vertices of the mesh (default: as the templates have)
         layout: layout of arrays of parameters, such as flame_artalk or arkit
         truth_layout: the same of the truth's (default: as --layout)
-        rig: what decodes parameters to vertices, the head at rest: a .glb, a folder of shapes, or FLAME's model file
+        rig: to decode parameters to vertices, the head at rest: a .glb, a folder of shapes, or FLAME's model file
         unit: unit of lengths of the scores: m, cm or mm (default: the protocol's, or the files')
         file_unit: unit of the files' vertices (default: as the rig or the corpus's manifest.json says)
         pattern: how predictions are named, repeatable (default: see the manual)

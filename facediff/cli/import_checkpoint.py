@@ -39,7 +39,7 @@ def import_checkpoint(
     Args:
         files: the checkpoint; both of a method with two stages; of VOCA the checkpoint and DeepSpeech's graph
         output: checkpoint to write (.ckpt)
-        doctor: write nothing, and print how the files differ from what is expected: names, shapes, hashes of files
+        doctor: write nothing, and print differences of the files from the expected ones: names, shapes, hashes of files
         facts: identities, mesh and corpus, which the checkpoint does not hold
         licence: which licences are accepted
     """

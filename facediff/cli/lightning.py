@@ -1,7 +1,7 @@
 """``facediff fit | validate | test | predict``: the arguments are checked and completed, then LightningCLI runs.
 
 Nothing heavy is imported before the arguments have been checked, so that a wrong option or a missing file is reported
-within a second; :mod:`facediff.cli.lightning_cli` is what runs then.
+within a second; :mod:`facediff.cli.lightning_cli` runs then.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def load_components() -> None:
 
 @contextmanager
 def exit_statuses() -> Iterator[None]:
-    """Let what is stopped end as a shell expects it, with 130 on Ctrl-C and 143 on SIGTERM; Lightning has 1 and 0.
+    """Exit as a shell expects after a stop, with 130 on Ctrl-C and 143 on SIGTERM; Lightning has 1 and 0.
 
     Lightning also goes on to ignore Ctrl-C, which the rest of this process may need.
     """

@@ -68,7 +68,7 @@ class PageServer:
     def announce(self, text: str, action: str) -> Callable[[str], None]:
         """A callback that gets the page's address once it is served, prints the text, and opens the page.
 
-        ``action`` is what visitors may do, for a note where others reach the page.
+        ``action`` of visitors is in the note if others can reach the page.
         """
 
         def ready(address: str) -> None:

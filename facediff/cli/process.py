@@ -54,7 +54,7 @@ def prepare_process() -> None:
     sys.stdout = io.TextIOWrapper(
         io.BufferedWriter(_StandardOutput(1, "w", closefd=False)),
         encoding=getattr(before, "encoding", None) or "utf-8",
-        errors="backslashreplace",  # names of files may hold what the terminal's encoding does not have
+        errors="backslashreplace",  # names of files may have characters that the terminal's encoding lacks
         line_buffering=bool(getattr(before, "line_buffering", False)),
         write_through=bool(getattr(before, "write_through", False)),
     )
@@ -128,7 +128,7 @@ def confirm_cost(yes: bool, lower: str, *, seconds: float = 0.0, size: float = 0
 
 
 def flush() -> None:
-    """Write what has been printed, so that a failure is noticed before the process ends."""
+    """Flush the output, so that a failure is noticed before the process ends."""
     if sys.stdout is not None:
         sys.stdout.flush()
 
@@ -173,20 +173,20 @@ def report(error: BaseException) -> int:
     refusal = next((cause for cause in chain(error) if _refuses(cause)), None)
     if refusal is not None:
         return fail(f"{' '.join(str(refusal).split())} ({more})")
-    if text.startswith("Does not validate"):  # jsonargparse's list of types, around what a constructor raised
+    if text.startswith("Does not validate"):  # jsonargparse's list of types, around a constructor's error
         error = list(chain(error))[-1]
         text = " ".join(str(error).split())
     position, is_bug = _position(error)
     return fail(
         f"unexpected {type(error).__name__}: {text[:300]} ({position}, facediff {facediff.__version__}); "
         f"{'this is a fault of facediff: ' if is_bug else ''}run the command again with {TRACEBACK}=1"
-        f"{' and report what it prints' if is_bug else ', which shows where'}",
+        f"{' and report its output' if is_bug else ', which shows where'}",
         FAULT,
     )
 
 
 def chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception and what it came from, outermost first."""
+    """An exception and its causes, outermost first."""
     visited: set[int] = set()
     while error is not None and id(error) not in visited:
         visited.add(id(error))
@@ -195,7 +195,7 @@ def chain(error: BaseException | None) -> Iterator[BaseException]:
 
 
 LIBRARIES = ("lightning", "omegaconf", "wandb")
-"""They say themselves what is wrong with an option."""
+"""Their own messages name the option."""
 
 
 def _refuses(error: BaseException) -> bool:

@@ -139,7 +139,7 @@ def write_transferred(
 
     def judge(transferred: Animation, fit: Correspondence, report: FitReport) -> None:
         reports.append(report)
-        if options.show is not None:  # the picture shows what is wrong
+        if options.show is not None:  # the picture shows the fault
             draw_correspondence(options.show, motion, transferred, fit)
         if not options.accept_poor:
             refuse_poor(target, reports[-1])

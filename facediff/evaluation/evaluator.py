@@ -145,7 +145,7 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
     clip only its scores are kept. The scores are those of :class:`facediff.metrics.ProtocolMetrics` over all clips.
 
     Args:
-        methods: folder of predictions by method; the first is what the others are compared with.
+        methods: folder of predictions by method; the others are compared with the first.
         truth: folder of truths.
         options: the fields of :class:`EvaluationOptions`, of which ``lips`` and ``n_vertices`` are needed.
     """

@@ -38,7 +38,7 @@ class Name:
     """The fields of a file's name."""
 
     subject: str  # who speaks
-    sentence: str  # what is said
+    sentence: str
     identity: str | None = None  # the condition of the prediction; None if the name does not say
 
     @property
@@ -278,13 +278,13 @@ def read_pairs(source: str | None, corpus: Path | None, n_vertices: int, kind: t
         n_vertices: vertices of the mesh.
         kind: of the lips or of the eyelids.
     """
-    file, option, what = PAIR_FILES[kind]
+    file, option, part = PAIR_FILES[kind]
     if source is None and corpus is not None and (corpus / file).is_file():
         source = str(corpus / file)
     if source is None:
         where = f"{corpus / file}: no such file" if corpus is not None else "the truth is no corpus folder"
         raise FaceDiffError(
-            f"{where}; give {option}, a file with one upper and one lower {what} vertex a line, or pairs such as "
+            f"{where}; give {option}, a file with one upper and one lower {part} vertex a line, or pairs such as "
             f"3531-3504 (the middle of FLAME's lips)"
         )
     with errors_of(f"{option} {source}"):

@@ -37,7 +37,7 @@ class RenderMetric(ABC):
     """Base of scores of rendered frames; a subclass defines :meth:`score`.
 
     Attributes:
-        part: what pictures show: the ``face``, or the ``mouth`` and as much around it.
+        part: in the pictures: the ``face``, or the ``mouth`` and as much around it.
         size: height and width of the pictures.
     """
 

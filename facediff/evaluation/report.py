@@ -144,7 +144,7 @@ class EvaluationReport:
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
     runs: list[Runs] = field(default_factory=list)  # of methods of which several training runs were given
     renders: dict[str, dict[str, float]] = field(default_factory=dict)  # means on renders, by method, and the truth
-    points: str = "vertices"  # what regions list: vertices, or channels where only these are scored
+    points: str = "vertices"  # in regions: vertices, or channels where only these are scored
 
     def regions(self) -> dict[str, dict[str, Any]]:
         """Name, vertex count, hash and repeated indices of each region."""
@@ -344,7 +344,7 @@ LISTED = 5  # Names that are listed before the rest is counted
 
 
 def text(report: EvaluationReport) -> str:
-    """Scores by protocol, comparisons, and what was cut, skipped or missing."""
+    """Scores by protocol, comparisons, and cut, skipped and missing files."""
     mesh = "mesh of " if report.points == "vertices" else ""
     lines = [
         f"truth {report.truth}" + (f", every {report.truth_stride}. frame" if report.truth_stride > 1 else ""),
@@ -464,7 +464,7 @@ def _cell(value: float, interval: Interval | None, sign: str = "") -> str:
 
 
 def _left_out(report: EvaluationReport) -> list[str]:
-    """What was cut, skipped or missing."""
+    """Cut, skipped and missing files."""
     lines = []
     if report.unnamed_truths:
         lines.append(f"truths whose names do not fit: {_names(report.unnamed_truths)}")

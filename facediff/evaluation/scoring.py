@@ -45,10 +45,10 @@ class Column:
     protocol: str  # the protocol's name; ``metrics`` for metrics that were chosen by name
     metric: str  # the score's name there: ``mve``, ``lve``, ``fdd``, ``fdd_absolute``, or the metric as it was chosen
     pooling: Pooling
-    rule: LengthRule  # what the protocol does where lengths differ
+    rule: LengthRule  # of the protocol for different lengths
     source: str  # which of the scorer's metrics gives the value of a sequence
     finish: Callable[[Tensor], Tensor] | None = None  # from that value to the score: sign, root and unit
-    region: dict[str, Any] | str = "all vertices"  # name, count and hash of what the score was taken over
+    region: dict[str, Any] | str = "all vertices"  # name, count and hash
     better: str | None = None  # ``lower``, ``higher``, ``zero``, or None; see :func:`facediff.metrics.describe_column`
     channels: bool = False  # whether it is of channels and not of vertices
     by_name: bool = False  # whether it is a metric that was chosen by name, also by a protocol

@@ -1,4 +1,4 @@
-"""User studies: videos of methods side by side, a page that asks raters about them, and what their answers say.
+"""User studies: videos of methods side by side, a page of questions for raters, and the analysis of their answers.
 
 From top to bottom: :func:`plan_study` reads and checks animations and makes a :class:`StudyPlan`, whose ``make`` writes
 the study's folder; :func:`serve` hands the page out and stores answers; :func:`analyse_folder` makes a

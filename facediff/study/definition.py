@@ -110,7 +110,7 @@ class Study:
 
     Attributes:
         title: shown above everything, by language.
-        consent: what raters agree to, by language.
+        consent: text by language.
         languages: the page's languages; the first is the default.
         methods: the methods; the first is the one that the others are compared with.
         questions: the questions, in order.

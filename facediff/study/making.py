@@ -34,7 +34,7 @@ from facediff.utils.progress import progress_bar
 from facediff.version import __version__
 
 LOCK = ".facediff-study.lock"
-SECONDS_PER_PIXEL = 4e-8  # What drawing and encoding a pixel of a frame takes on one core
+SECONDS_PER_PIXEL = 4e-8  # Drawing and encoding a pixel of a frame on one core
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ class StudyClip:
         subject: who speaks.
         motions: by condition: a method, or ``truth``.
         sound: the recording, or an animation (.npz) that holds it.
-        frames: that every condition has; what is longer is cut.
+        frames: of every condition, by cutting the longer ones.
         frame_rate: frames a second.
         templates: neutral faces in one unit, for a camera that sees them all.
         colours: vertex colours (V, 3) that all are drawn with; None for the material of the renderer.

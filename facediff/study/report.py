@@ -93,7 +93,7 @@ class StrengthScores:
     """Bradley-Terry scores of one question.
 
     Attributes:
-        question: what was asked.
+        question: name.
         scores: by condition, natural logarithms of strength, with mean 0.
         intervals: by condition.
         robust: whether the intervals take raters, not single answers, as independent.
@@ -112,7 +112,7 @@ class Agreement:
     """Krippendorff's alpha of one question.
 
     Attributes:
-        question: what was asked.
+        question: name.
         alpha: 1 if all raters agree, 0 if they do not more than by chance.
         interval: over the videos, drawn again.
         units: videos that at least two raters judged.

@@ -114,7 +114,7 @@ class AnswerStore:
     def finish(self, token: str, comments: Mapping[str, str]) -> bool:
         """Store a rater's comments, and that the rater has finished; False if answers are missing.
 
-        What was stored first stays.
+        The first stored answer stays.
         """
         with self._write() as database:
             number = int(database.execute("SELECT number FROM raters WHERE token = ?", (token,)).fetchone()[0])

@@ -51,7 +51,7 @@ class Moment:
     """A moment of a clip."""
 
     time: float  # in seconds
-    phoneme: TimedPhoneme | None = None  # what is spoken then; None if it was chosen by its time alone
+    phoneme: TimedPhoneme | None = None  # None if it was chosen by its time alone
 
     @property
     def heading(self) -> Heading:
@@ -99,7 +99,7 @@ def draw_frames(
     """Draw truth and methods, a row each, at chosen moments, a column each.
 
     Args:
-        material: what to draw from.
+        material: of the evaluation.
         clip: ``<subject>_<sentence>``.
         moments: the columns.
         output: ``.png``, ``.pdf`` or ``.svg``.

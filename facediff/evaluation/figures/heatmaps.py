@@ -151,7 +151,7 @@ def draw_heatmap(
     """Draw mean and standard deviation over time of each vertex's distance from the template, truth and methods.
 
     Args:
-        material: what to draw from.
+        material: of the evaluation.
         clips: names of clips.
         output: ``.png``, ``.pdf`` or ``.svg``.
         paper: width, resolution and font.
@@ -161,7 +161,7 @@ def draw_heatmap(
         scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
 
     Returns:
-        notes on what was left out.
+        notes on omissions.
     """
     rows = {"mean of motion": "mean", "std of motion": "deviation"}
     reading = partial(motion_maps, workers=workers, scheduler=scheduler)
@@ -203,7 +203,7 @@ def _draw_maps(
     paper: Paper,
     view: str,
 ) -> list[str]:
-    """Draw a row for each label and the attribute of the maps that it shows; notes on what was left out."""
+    """Draw a row for each label and the its attribute of the maps; notes on omissions."""
     check_output(output)
     material.mesh(clips)  # refuses before the work
     maps, notes = reading(material, clips)

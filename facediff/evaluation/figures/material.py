@@ -42,7 +42,7 @@ FLAT = Look(
     background_top=WHITE,
     background_bottom=WHITE,
 )
-"""For colours that stand for numbers: what faces the viewer has exactly its colour, without highlights."""
+"""For colours that stand for numbers: surfaces towards the viewer have exactly their colour, without highlights."""
 
 HALF = math.tan(FIELD_OF_VIEW / 2)
 

@@ -61,7 +61,7 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
     columns: dict[str, dict[float, float]] = {}
     try:
         x: str | None = None
-        for row in read_rows(path, remedy="expected what CSVLogger writes during training"):
+        for row in read_rows(path, remedy="expected a metrics.csv of CSVLogger"):
             # Rows of the learning rate have no epoch: they belong to the epoch of the row before.
             x = row.get(axis) or (x if axis == "epoch" else None)
             for name, text in row.items():
@@ -70,7 +70,7 @@ def read_curves(path: Path, axis: Axis = "step") -> dict[str, Curve]:
     except ValueError:
         columns = {}
     if not columns:
-        raise FaceDiffError(f"{path}: holds no numbers over {axis}s; expected what CSVLogger writes during training")
+        raise FaceDiffError(f"{path}: holds no numbers over {axis}s; expected a metrics.csv of CSVLogger")
     tables = {name: np.array(sorted(points.items()), np.float64) for name, points in sorted(columns.items())}
     return {name: Curve(table[:, 0], table[:, 1]) for name, table in tables.items()}
 
@@ -85,15 +85,15 @@ def choose_scalars(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[st
 
 
 def find_gaps(runs: Mapping[str, Mapping[str, Curve]], scalars: Sequence[str], *, log: bool = False) -> list[str]:
-    """Notes on values that a drawing cannot show: NaN and infinity, and on a logarithmic axis what is not above 0."""
+    """Notes on values that a drawing cannot show: NaN and infinity, and on a logarithmic axis values not above 0."""
     notes = []
     for scalar in scalars:
         for run, curves in runs.items():
             values = curves[scalar].values
             drawable = np.isfinite(values) & ((values > 0) | (not log))
             if not drawable.all():
-                what = "NaN, infinity or not above 0" if log else "NaN or infinity"
-                notes.append(f"{run}: {(~drawable).sum()} of {len(values)} values of {scalar} are {what} and not drawn")
+                kind = "NaN, infinity or not above 0" if log else "NaN or infinity"
+                notes.append(f"{run}: {(~drawable).sum()} of {len(values)} values of {scalar} are {kind} and not drawn")
     return notes
 
 

@@ -1,5 +1,5 @@
-// One rater's way through the study: welcome, trials, last questions, thanks. What the rater has done is kept in this
-// browser after every step; where a server of `facediff study serve` answers, it is sent there as well.
+// One rater's way through the study: welcome, trials, last questions, thanks. Answers are stored in this browser after
+// every step, and sent to the server of `facediff study serve` if there is one.
 (() => {
 "use strict";
 const study = JSON.parse(document.getElementById("study").textContent);
@@ -8,13 +8,13 @@ const key = `facediff study ${study.id}`;
 const choices = study.questions.filter((question) => question.kind === "choice");
 const fields = study.questions.filter((question) => question.kind === "text");
 const SEEN = 0.9; // share of a video that has to be played before it may be judged
-const AGAIN = 3000; // milliseconds until what could not be sent is sent again
+const AGAIN = 3000; // milliseconds until the next try to send
 
-let kept = null; // the state in this browser when its storage cannot be used
-let served = false;
+let memory = null; // the state in this browser when its storage cannot be used
+let hasServer = false;
 let current = null; // the trial on the screen: {trial, since, plays, seen}
-let sending = false;
-let beginning = null; // the timer of the next try to begin
+let isSending = false;
+let retryTimer = null; // the timer of the next try to begin
 const problems = [];
 const warnings = new Set(); // names of the texts that warn
 
@@ -29,26 +29,26 @@ function random() {
 }
 
 function load() {
-  if (kept) return kept;
+  if (memory) return memory;
   try {
     const found = JSON.parse(localStorage.getItem(key));
-    if (found && found.study === study.id && /^[0-9a-f]{32}$/.test(found.rater)) kept = found;
+    if (found && found.study === study.id && /^[0-9a-f]{32}$/.test(found.rater)) memory = found;
   } catch { /* no storage, or damaged: begin again */ }
-  if (!kept) {
-    kept = {
+  if (!memory) {
+    memory = {
       format: study.answers, study: study.id, rater: random(), number: null, language: null, code: "",
       started: null, finished: null, trials: [], comments: {}, sent: 0, closed: false,
     };
   }
-  return kept;
+  return memory;
 }
 
 function save() {
-  try { localStorage.setItem(key, JSON.stringify(kept)); } catch { /* the state lives as long as the page */ }
+  try { localStorage.setItem(key, JSON.stringify(memory)); } catch { /* the state lives as long as the page */ }
 }
 
 function forget() {
-  kept = null;
+  memory = null;
   try { localStorage.removeItem(key); } catch { /* there is none */ }
 }
 
@@ -64,9 +64,9 @@ async function post(path, content) {
   });
   if (!answer.ok) {
     const error = new Error(`${path}: ${answer.status}`);
-    error.refused = [400, 409, 413].includes(answer.status); // whatever is sent again will be too
+    error.refused = [400, 409, 413].includes(answer.status); // again if repeated
     error.full = answer.status === 403;
-    error.unknown = answer.status === 404; // the server's answers are not those that this rater has begun in
+    error.unknown = answer.status === 404; // the server does not know this rater
     throw error;
   }
   return answer.json();
@@ -80,15 +80,15 @@ async function findServer() {
   } catch { return false; }
 }
 
-// Sends what has not been sent, in order. The server keeps the first of equal submissions, so that sending twice is safe.
+// Sends unsent answers in order. The server keeps the first of equal submissions.
 async function send() {
-  if (!served || sending) return;
-  sending = true;
+  if (!hasServer || isSending) return;
+  isSending = true;
   const state = load();
   try {
     while (state.sent < state.trials.length) {
       await post("api/answers", { study: study.id, rater: state.rater, ...state.trials[state.sent] }).catch((error) => {
-        if (!error.refused) throw error; // else those after it are sent; it stays in this browser
+        if (!error.refused) throw error; // it stays in this browser, and the next one is sent
       });
       state.sent += 1;
       save();
@@ -98,7 +98,7 @@ async function send() {
         () => { state.closed = true; },
         (error) => {
           if (!error.refused) throw error;
-          served = false; // the rater hands the file over
+          hasServer = false; // the rater hands the file over
         },
       );
       save();
@@ -108,10 +108,10 @@ async function send() {
   } catch (error) {
     warn("waiting", !error.unknown);
     if (error.unknown) {
-      served = false; // the rater hands the file over
+      hasServer = false; // the rater hands the file over
       if (!byId("thanks").hidden) showThanks();
     } else setTimeout(send, AGAIN);
-  } finally { sending = false; }
+  } finally { isSending = false; }
 }
 
 function warn(name, on = warnings.has(name)) {
@@ -120,7 +120,7 @@ function warn(name, on = warnings.has(name)) {
   byId("status").textContent = [...warnings].map(text).join(" ");
 }
 
-// What is shown.
+// Display.
 
 function translate() {
   const state = load();
@@ -261,25 +261,25 @@ function showThanks() {
   const state = load();
   byId("completion").textContent = state.rater.slice(0, 8).toUpperCase();
   const link = byId("download");
-  link.hidden = served && state.closed;
-  byId("thanks-more").textContent = served ? (state.closed ? text("stored") : "") : text("hand_over");
+  link.hidden = hasServer && state.closed;
+  byId("thanks-more").textContent = hasServer ? (state.closed ? text("stored") : "") : text("hand_over");
   if (address) URL.revokeObjectURL(address);
   address = URL.createObjectURL(new Blob([answersFile()], { type: "application/json" }));
   link.href = address;
   link.download = `answers-${study.id}-${state.rater.slice(0, 8)}.json`;
 }
 
-// What the rater does.
+// Actions of the rater.
 
 async function begin() {
   const state = load();
-  clearTimeout(beginning);
+  clearTimeout(retryTimer);
   if (byId("welcome").dataset.left) return;
   byId("start").disabled = true;
   try {
     if (state.number === null) {
       state.code = byId("code").value.trim();
-      if (served) {
+      if (hasServer) {
         const { rater, language, code } = state;
         state.number = (await post("api/raters", { study: study.id, rater, language, code, agreed: true })).number;
       } else {
@@ -299,7 +299,7 @@ async function begin() {
     warn("waiting", !final);
     warn("refused", final);
     if (final) setTimeout(() => { byId("start").disabled = !byId("agree").checked; }, 500); // with another code it may do
-    else beginning = setTimeout(() => { if (byId("agree").checked) begin(); }, AGAIN);
+    else retryTimer = setTimeout(() => { if (byId("agree").checked) begin(); }, AGAIN);
   }
 }
 
@@ -404,7 +404,7 @@ function listen() {
 }
 
 async function main() {
-  served = await findServer();
+  hasServer = await findServer();
   chooseLanguage();
   byId("remark").textContent = study.remark;
   const state = load();
@@ -417,7 +417,7 @@ async function main() {
   listen();
   show();
   send();
-  window.facediffStudy = { get state() { return load(); }, get current() { return current; }, problems, served, study };
+  window.facediffStudy = { get state() { return load(); }, get current() { return current; }, problems, hasServer, study };
 }
 
 main();
