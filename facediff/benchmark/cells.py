@@ -1,6 +1,6 @@
 """The cells of a plan: every row on every corpus with every seed, and the recipe of each.
 
-Two cells whose recipes are equal have equal results, so the recipe's hash is the cell's name on the disk. A changed
+Two cells with equal recipes have equal results, so the recipe's hash is the cell's name on the disk. A changed
 plan, a changed config that it names, a changed checkpoint or a changed corpus thus makes new cells of those that it
 concerns, and finds the results of all others.
 """

@@ -160,7 +160,7 @@ class BenchmarkPlan:
 
 
 def find_plan(path: Path) -> Path:
-    """The file of a plan; those of the package are found by ``configs/benchmark/NAME.yaml``, and by NAME alone."""
+    """The file of a plan; bundled ones are found by ``configs/benchmark/NAME.yaml``, and by NAME alone."""
     if path.is_file():
         return path
     file = path if path.suffix == ".yaml" else Path(f"{path}.yaml")

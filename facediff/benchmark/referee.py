@@ -352,7 +352,7 @@ def another(clip: SpokenClip, clips: Sequence[SpokenClip]) -> SpokenClip:
 
 
 def reference_judgement(clips: Sequence[SpokenClip], frame_rate: float = 25.0) -> Judgement:
-    """The row of the reference itself, whose faults are not planted."""
+    """The row of the reference itself, without planted faults."""
     scores = RefereeScores(frame_rate)
     for clip in clips:
         motion = reference(clip, frame_rate)

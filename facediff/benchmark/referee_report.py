@@ -101,7 +101,7 @@ def document(report: RefereeReport, drawings: Sequence[Drawing] = ()) -> list[Bl
 
 
 def scores_table(report: RefereeReport) -> ReportTable:
-    """A row for each model, the reference's, and those of planted faults."""
+    """A row for each model, the reference and each planted fault."""
     sound = [*report.rows]
     rows: list[list[str]] = [[row.name, *_cells(row.scores)] for row in sound]
     marks: dict[tuple[int, int], str] = {}

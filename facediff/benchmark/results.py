@@ -27,7 +27,7 @@ CURVES = ("val/lve", "val/energy", "val/mve")
 
 
 class Rows:
-    """Rows of scores: all have a split, a method and a number of frames, and those of sentences a clip."""
+    """Rows of scores: all have a split, a method and a number of frames, and a clip if they are of a sentence."""
 
     def __init__(self, *keys: str) -> None:
         self.keys = keys

@@ -54,7 +54,7 @@ class Setting:
         truths: arguments of `facediff evaluate` for the truth (folder, frame stride), by corpus.
         classes: data module of each corpus that is no part of facediff, which a checkpoint may not import by itself.
         models: class of each trained row's model that is no part of facediff, for the same reason.
-        roots: folder of each corpus whose data config names one, for checkpoints that know none, or another machine's.
+        roots: folders of corpora by the data config, for checkpoints without one of this machine.
         launcher: how a facediff command is started.
     """
 

@@ -181,7 +181,7 @@ def compared(
 ) -> dict[str, tuple[Difference, float | None]]:
     """Every row against one, with p-values corrected for the number of rows: one family for each score and split.
 
-    Reference rows are not in the family, whose power they would cost; their p-values stay as they are.
+    Reference rows are not in the family, since they would cost power; their p-values are not corrected.
     """
     differences = {
         name: difference(scores, rows[baseline], bootstrap) for name, scores in rows.items() if name != baseline
@@ -219,7 +219,7 @@ def marked(rows: Mapping[str, RowScores], better: str | None, bootstrap: Bootstr
     Args:
         rows: scores by row, without the reference rows.
         better: ``lower`` or ``higher``; with another value nothing is marked, since no direction is the better one.
-        bootstrap: its level is that of significance.
+        bootstrap: its level is also the level of significance.
     """
     if better not in ("lower", "higher") or len(rows) < 2:
         return {}

@@ -314,7 +314,7 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
         text = stream.read()
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(end) < text.index(begin):
         raise FaceDiffError(f"{path}: has no block for {name}; add the two lines  {begin}  and  {end}  to the page")
-    # Headings of the page stand above those of the tables.
+    # Headings of the page are one level above the tables'.
     blocks = body(report, {})
     lowered = [replace(block, level=block.level + 1) if isinstance(block, Title) else block for block in blocks]
     block = f"{begin}\n\n{markdown(lowered)}\n".replace("\n", "\r\n" if "\r\n" in text else "\n")

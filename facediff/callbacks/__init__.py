@@ -25,7 +25,7 @@ __all__ = [
 
 
 def defaults() -> list[Callback]:
-    """The callbacks of every run of the command line, for a ``Trainer`` of one's own.
+    """The callbacks of every run of the command line, for your own ``Trainer``.
 
     They keep ``last.ckpt``, print and write the scores of a test and the files of ``predict``, and log the description
     of a run and the norm of the gradient.

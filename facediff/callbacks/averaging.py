@@ -18,7 +18,7 @@ from facediff.utils.ranges import Range
 
 
 class EmaWithWarmup(WeightAveraging):
-    """Exponential moving average of the weights whose decay rises from a small value to ``decay``.
+    """Exponential moving average of the weights with a decay that rises from a small value to ``decay``.
 
     After k averaged steps the decay is min(``decay``, (1 + k) / (``warmup`` + k)), as in TensorFlow's
     ``ExponentialMovingAverage``. A constant decay d keeps the share dⁿ of the first, untrained weights after n steps:

@@ -2,7 +2,7 @@
 
 ``last.ckpt`` is the newest state of a run, written at an interval. Training that is stopped in any way (Ctrl-C,
 SIGTERM, a cluster's requeue signal, kill -9, a full disk) continues from it with the same data order, random numbers,
-schedules, averages and log files, so that weights and curves equal those of a run that was never stopped.
+schedules, averages and log files, so that weights and curves equal an uninterrupted run's.
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ class LastCheckpoint(Callback):
         return run_folder(trainer) / LAST
 
     def stop(self, trainer: Trainer, number: int) -> None:
-        """End training on all processes; the exit status is that of a process which the signal has ended."""
+        """End training on all processes; the exit status is as after the signal itself."""
         self._signals.remove()
         # A process that was started by the first one must not look as if it had failed, or all others are killed.
         status = 0

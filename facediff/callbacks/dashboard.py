@@ -195,7 +195,7 @@ class ClipErrors:
 
 
 def lip_error(scores: Container[str]) -> str:
-    """The name of the lips' error among scores, or that of all vertices' by protocols which have none of the lips."""
+    """The name of the lips' error among scores, or of all vertices' error by protocols without lips."""
     return "lve" if "lve" in scores else "mve"
 
 

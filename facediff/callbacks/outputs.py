@@ -193,7 +193,7 @@ def describe_groups(rows: list[dict[str, Any]], by: Sequence[str]) -> str:
 class PredictionWriter(BasePredictionWriter):
     """Writes every predicted clip as ``<clip>_condition_<identity>.npy``, (T, 3V) absolute vertices, float32.
 
-    The name and the shape are those of the field's released projects, so that their scripts read the files.
+    Released projects use the same names and shapes, so that their scripts read the files.
 
     Args:
         output_dir: the folder; ``predictions`` in the run's folder if None.

@@ -262,7 +262,7 @@ def averaged_weights(trainer: Trainer, model: LightningModule) -> Iterator[None]
 
 @torch.no_grad()
 def copy_weights(source: dict[str, Tensor], target: dict[str, Tensor]) -> None:
-    """Copy all weights of ``target`` from those of the same name."""
+    """Copy all weights of ``target`` by name."""
     for name, tensor in target.items():
         tensor.copy_(source[name])
 
@@ -329,7 +329,7 @@ def draw_clip(
     """Draw truth, prediction and error of one clip, and write the video and the sheet; each whole or not at all.
 
     The motion is offsets from the template, and the files get the clip's name; ``error_scale`` (in the corpus's unit),
-    ``size`` and ``view`` are those of :class:`SamplingPreview`.
+    ``size`` and ``view`` are as in :class:`SamplingPreview`.
     """
     assets, name = model.assets.scored, sample.identity_name
     clip_scores = scores(model, sample, motion)
@@ -374,7 +374,7 @@ def draw_clip(
 
 
 def scores(model: AnimationModel, sample: Sample, motion: Tensor) -> dict[str, float]:
-    """The protocol's metrics of one clip; in this process alone, unlike those of a whole split."""
+    """The protocol's metrics of one clip; in this process alone."""
     evaluation, truth = model.evaluation, sample.motion
     if not evaluation.protocol.channels:
         truth, motion = (model.assets.to_scored(offsets, sample.identity_name) for offsets in (truth, motion))

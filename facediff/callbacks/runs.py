@@ -68,7 +68,7 @@ def run_folder(trainer: Trainer) -> Path:
 
 
 def run_of(checkpoint: Path) -> Path | None:
-    """The folder of the run whose ``last.ckpt`` a file is; None for every other file."""
+    """The folder of the run with this ``last.ckpt``; None for every other file."""
     return checkpoint.parents[1] if checkpoint.parts[-2:] == LAST.parts else None
 
 
@@ -131,7 +131,7 @@ def _has_version(entries: Entries) -> bool:
 
 
 def _began_training(config: Path) -> bool:
-    """Whether a config is of a run of ``fit``: those of scoring stand next to them, and have options of their own."""
+    """Whether a config is of a run of ``fit``; configs of scoring are next to it, with options of their own."""
     if not config.is_file():
         return False
     return re.search(r"^(verbose|return_predictions):", config.read_text("utf-8", "replace"), re.MULTILINE) is None
@@ -285,7 +285,7 @@ class ResumableCSVLogger(CSVLogger):
     def keep(self, rows: int) -> None:
         """Keep the first rows only: the steps after them will be repeated."""
         path = self.experiment.path
-        if self.continues and not rows:  # the file may be that of a run before
+        if self.continues and not rows:  # the file may be of an earlier run
             self.table = MetricsFile(Path(self.log_dir))
         elif self.continues and path.is_file():
             header, written = read_rows(path)
@@ -309,7 +309,7 @@ class MetricsFile:
     """``metrics.csv`` and ``hparams.yaml`` of a run; the file of an earlier run stays until the first rows replace it.
 
     Args:
-        folder: that of the run.
+        folder: of the run.
         continues: add to the file that is there.
     """
 

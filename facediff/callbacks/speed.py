@@ -19,7 +19,7 @@ from facediff.utils.hints import checks_arguments
 from facediff.utils.progress import track
 
 Backend = Callable[..., Any]
-"""A compiler of one's own, as ``torch.compile`` takes it."""
+"""Your own compiler, as ``torch.compile`` takes it."""
 
 
 class SpeechFeatureCache(Callback):

@@ -38,7 +38,7 @@ class TrainingOptions:
 
     Attributes:
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
-        train: train all weights, those of identity and style only (person), or those of the face only (head); by
+        train: all weights, identity and style only (person), or the face only (head); by
             default all with --person, and head with --face
         epochs: epochs over the training clips
         learning_rate: falls to 0 as a cosine
@@ -298,7 +298,7 @@ def write_distilled(
     with progress_bar(options.goal, options.steps, shown=not quiet) as step:
         error = distil_audio_encoder(model, data, options, step, teacher=teacher)
     weights = {**encoder_weights(model), **model.fit_to_features(data)}
-    # With averaged weights, those of the last step are kept for a training that goes on.
+    # Beside averaged weights, the last step's are kept for further training.
     for key in ("state_dict", "current_model_state"):
         if key in content:
             content[key] = {**content[key], **weights}

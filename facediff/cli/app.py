@@ -1,7 +1,7 @@
 """The command ``facediff``: finds the subcommand and hands over; imports nothing heavy by itself.
 
-Other packages add commands of one word by entry points in the group ``facediff.command``, whose target is a typed
-function, as those of this package are::
+Other packages add commands of one word by entry points in the group ``facediff.command``, with a typed
+function as the target, as in this package::
 
     [project.entry-points."facediff.command"]
     my-command = "my_package.my_module:my_command"
@@ -197,7 +197,7 @@ def find(arguments: Sequence[str]) -> tuple[str, list[str]]:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status, as docs/command_line.md lists them.
 
-    ``args`` are the words after ``facediff``; if None, those of the process, whose streams and signals are set up.
+    ``args`` are the words after ``facediff``; if None, the process's own, with its streams and signals set up.
     """
     if args is not None:
         return answer(args)

@@ -117,12 +117,12 @@ def report(
 
     Args:
         folders: folders of benchmarks, such as benchmarks/quick
-        output: folder for the files, whose names begin with the plan's (default: report/ of each folder)
+        output: folder for the files, with names that begin with the plan's (default: report/ of each folder)
         baseline: the row that all others are compared with (default: the plan's)
         bootstrap: resamples of the sentences for intervals; 0: none
         level: of the intervals; a corrected p below 1 - level is significant
         seed: of resamples and permutations
-        page: a Markdown page whose marked blocks get the tables of the plans that they name
+        page: a Markdown page with marked blocks for the tables of named plans
     """
     from facediff.benchmark.outline import read_outline
     from facediff.benchmark.plan import MEAN_SUFFIX

@@ -29,7 +29,7 @@ class WeightOptions:
         sparsity: cost of weights, which keeps shapes at 0 that would cancel one another; 0 is off
         bounds: limits of weights (default: 0 1)
         region: look at a region of the face only, such as lips
-        only_arkit: leave out shapes whose names are not ARKit's (for the table of Live Link they always are)
+        only_arkit: leave out shapes with other names than ARKit's (for the table of Live Link they always are)
         residual_limit: share of the motion that weights may leave before they are refused
     """
 
@@ -82,7 +82,7 @@ def blendshapes(
         animation: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
         output: table to write
         shapes: folder of .obj or .ply files named jawOpen, mouthFunnel … with the face at rest as neutral, or a .glb
-            with named targets, or "puppet" for those of the built-in face
+            with named targets, or "puppet" for the built-in face's
         write_puppet_shapes: write shapes of the built-in puppet's face (of the speaker --identity) and do nothing else
         weights: how they are solved for.
         table: how they are written.
@@ -146,5 +146,5 @@ def remarks(weights: Weights, *, plain: bool) -> list[str]:
             f"absent, so that their weights are 0 and say nothing ({len(weights.absent)}): {', '.join(weights.absent)}"
         )
     if weights.extra and not plain:
-        lines.append(f"not in this table, whose columns are ARKit's; use --plain: {', '.join(weights.extra)}")
+        lines.append(f"not in this table of ARKit's columns; use --plain: {', '.join(weights.extra)}")
     return lines

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from facediff.animation import Animation
 
 PACKAGES = ("numpy", "onnxruntime", "torch", "torchmetrics", "lightning", "transformers", "scipy", "trimesh")
-"""Packages whose versions a bug report needs."""
+"""Packages with versions that a bug report needs."""
 GROUPS = ("all", "dev", "docs", "test", "cli", "audio", "runtime")
 """Extras that are sums of others, of development, or a part of every installation."""
 SECONDS = 10

@@ -128,7 +128,7 @@ corpora: {corpora}; `facediff data prepare <corpus> --help` lists the options of
 
 
 def run(name: str, arguments: Sequence[str]) -> int:
-    """``facediff data prepare``: choose the corpus, whose plan has the options, and prepare it."""
+    """``facediff data prepare``: choose the corpus and its plan with the options, and prepare it."""
     if not arguments or arguments[0] in ("-h", "--help"):
         tell(*PREPARE.format(corpora=", ".join(CORPORA)).split("\n"))
         return 0 if arguments else 2
@@ -186,7 +186,7 @@ def describe(report: PreparationReport) -> list[str]:
 
 
 def grouped(entries: dict[str, str]) -> list[str]:
-    """A line for each entry, but one line for clips of a subject whose texts differ in the clip's name only."""
+    """A line for each entry, but one line for clips of a subject with texts that differ in the clip's name only."""
     groups: dict[tuple[str, str], list[str]] = {}
     for key, text in entries.items():
         subject, _, sentence = key.rpartition("_")
@@ -226,7 +226,7 @@ def pack(
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size
         exact: keep test clips and their style references bit for bit, so that scores stay the same; or none
-        unit: the corpus's unit of length, m, cm, mm, in, or a number of metres (default: that of its manifest.json, or
+        unit: the corpus's unit of length, m, cm, mm, in, or a number of metres (default: by its manifest.json, or
             the corpus's own)
         chunk_seconds: motion is read in pieces of this length
         codec: how motion is compressed; lz4 is read faster and takes an eighth more room

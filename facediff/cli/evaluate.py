@@ -43,7 +43,7 @@ class ScoreOptions:
         eyelid_pairs: pairs of eyelid vertices, for blinks, as --lip-pairs
         by: group scores by attributes of clips too: columns of the corpus's clips.csv, such as emotion,intensity
         render: score renders too, by networks of your own, such as onnx:graph=net.onnx; repeatable
-        mesh: mesh file whose triangles are rendered (default: the rig's)
+        mesh: mesh file with the triangles to render (default: the rig's)
         bootstrap: resamples for intervals; 0: none
         level: of the intervals
         seed: of the resamples

@@ -42,7 +42,7 @@ def export_model(
         steps: its denoising steps
         quick_steps: its denoising steps at low latency (default: 2)
         speech: recording that the folder is compared with the model on; a made-up sound by default
-        identities: whose faces and styles the folder has (default: all that the model knows)
+        identities: speakers of the folder's faces and styles (default: all that the model knows)
     """
     if model is None or bundled_by_name(model) is BUNDLED:
         options: dict[str, object] = {"sampler": sampler, "steps": steps, "quick_steps": quick_steps, "speech": speech}

@@ -245,7 +245,7 @@ def draw_maps(
     maps: MapOptions,
     highest: float | None,
 ) -> None:
-    """Draw maps of vertices, whose second row has the scale that ends at ``highest``, and report the file."""
+    """Draw maps of vertices, the second row with the scale up to ``highest``, and report the file."""
     notes = draw(
         material,
         material.choose(maps.clips),

@@ -79,7 +79,7 @@ def generation_metrics(
         checkpoints: trained models (.ckpt) of one corpus
         splits: val, test_a, test_b, test_c (default: all test splits)
         max_clips: clips of a split at most, evenly spread, for a quick look (default: all)
-        against: a checkpoint, or a file of --json, whose values are printed next to these with the ratios
+        against: a checkpoint, or a file of --json: its values are printed next to these with the ratios
         data_root: where the corpus is, if not where it was in training
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class
         eyelid_pairs: file with pairs of eyelid vertices (default: regions/eyelid_pairs.txt in the corpus's folder)

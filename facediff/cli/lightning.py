@@ -54,7 +54,7 @@ HELP = """usage: facediff {name} [--config FILE] [--OPTION=VALUE ...]
 examples: facediff fit --config configs/experiment/puppet.yaml --trainer.max_epochs=20
           facediff test --ckpt_path runs/puppet/version_0/checkpoints/best.ckpt
 """
-"""Without Lightning, whose import takes most of the seconds that its own help takes."""
+"""Without the import of Lightning, which takes seconds."""
 
 SUMMARIES = {
     "fit": ("Train a model", "continue from"),
@@ -263,7 +263,7 @@ def corpus_and_folder(
 
 
 def prepared(data: SpeechMotionDataModule) -> SpeechMotionDataModule:
-    """A data module whose corpus is on this machine."""
+    """A data module with its corpus on this machine."""
     data.prepare_data()
     _ = data.corpus
     return data

@@ -55,7 +55,7 @@ LINKS = ("n_vertices", "identities", "frame_rate", "space", "faces")
 
 
 def run_lightning_cli(name: str, arguments: Sequence[str], experiment: str) -> FaceDiffCLI:
-    """Run a subcommand whose words are checked and complete; see :func:`facediff.cli.lightning.run_cli`."""
+    """Run a subcommand of complete arguments; see :func:`facediff.cli.lightning.run_cli`."""
     logger = {"class_path": LOGGERS[0], "init_args": {"save_dir": "runs", "name": experiment}}
     with (
         parsing([name, *arguments], experiment),
@@ -394,7 +394,7 @@ def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
 
 
 def logger_options(trainer: Mapping[str, Any], kind: str) -> Mapping[str, Any] | None:
-    """Options of the first logger whose class has this name; None if there is none."""
+    """Options of the first logger of this class name; None if there is none."""
     loggers = trainer.get("logger")
     for logger in loggers if isinstance(loggers, list) else [loggers]:
         if str(getattr(logger, "class_path", "")).endswith(kind):
@@ -423,7 +423,7 @@ def answers(address: str, patience: float = PATIENCE) -> bool:
         try:
             urllib.request.urlopen(address, timeout=patience).close()  # noqa: S310 (the user's own setting)
         except urllib.error.HTTPError as error:
-            if error.code >= 500:  # a gateway whose server is down; "not found" is an answer
+            if error.code >= 500:  # a gateway without its server; "not found" is an answer
                 return
         except (OSError, ValueError):
             return

@@ -2,7 +2,7 @@
 
 A command is a typed function. Its parameters are its options: the name, the type hint, the default and the docstring's
 ``Args:`` entry become flag, type, default and help text. A parameter that may be given by position in Python is a
-positional argument of the command, too. A parameter whose type is a dataclass is a group of options, which several
+positional argument of the command, too. A parameter with a dataclass as its type is a group of options, which several
 commands may share: the dataclass's fields are the options, and the function receives an instance.
 
 It is the standard library's argparse that splits the words; this module adds the conversion to the declared types
@@ -166,7 +166,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, Parameter | OptionG
 
 
 def flat(parameters: Parameters) -> list[Parameter]:
-    """All parameters, those of groups included."""
+    """All parameters, also in groups."""
     entries = ([entry] if isinstance(entry, Parameter) else entry.parameters for entry in parameters.values())
     return [parameter for entry in entries for parameter in entry]
 
@@ -234,7 +234,7 @@ def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401 - argparse's
         action = "store_false" if parameter.default else "store_true"
         parser.add_argument(*flags, dest=parameter.name, action=action, **keywords)
         return
-    # argparse calls the function with defaults that are texts, too; those of type hints are values already.
+    # argparse calls the function with defaults that are texts, too; type hints' defaults are values already.
     keywords["type"] = lambda word: word if word == parameter.default else parameter.read(word)
     if option.metavar:
         keywords["metavar"] = option.metavar
@@ -265,7 +265,7 @@ def parse(
     summary: str = "",
     details: str | Callable[[], str] = "",
 ) -> dict[str, Any]:
-    """The values of a command's parameters; those of a group as an instance of its dataclass."""
+    """The values of a command's parameters; a group is an instance of its dataclass."""
     options = flat(parameters)
     end = arguments.index("--") if "--" in arguments else len(arguments)
     arguments = [*map(with_dashes, arguments[:end]), *arguments[end:]]
@@ -324,7 +324,7 @@ def refuse_ineffective(parameters: Sequence[Parameter], values: Mapping[str, Any
 
 
 def refuse_idle(reason: str, **options: bool) -> None:
-    """Refuse options without an effect, such as those of batches for one recording.
+    """Refuse options without an effect, such as options of batches for one recording.
 
     Args:
         reason: where the options have an effect, as in "is for one recording".
@@ -352,7 +352,7 @@ Function = typing.TypeVar("Function", bound=Callable[..., Any])
 
 
 def with_more_help(text: Callable[[], str]) -> Callable[[Function], Function]:
-    """Decorator of a command whose help ends with text that is costly to make, and made when the help is printed."""
+    """Decorator of a command: its help ends with a costly text, which is made when the help is printed."""
 
     def decorate(function: Function) -> Function:
         vars(function)["more_help"] = text

@@ -84,7 +84,7 @@ def _stop(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 class _StandardOutput(io.FileIO):
-    """Standard output whose failure is an error of its own, not one of the file that is being written meanwhile."""
+    """Standard output with an error of its own, not of the file being written meanwhile."""
 
     def write(self, data: Any) -> int:  # noqa: ANN401 - any buffer
         try:

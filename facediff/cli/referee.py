@@ -36,7 +36,7 @@ def referee(
     sentences: Annotated[ranges.Samples, Option(metavar="N")] = 3,
     write_speech: Annotated[Path | None, Option(metavar="FOLDER", writes="folder")] = None,
 ) -> int:
-    """Compare models on one face and the same speech, whose phonemes are known.
+    """Compare models on one face and the same speech with known phonemes.
 
     MODEL is NAME=PATH or PATH of a checkpoint, a model folder, an exported folder or a folder of Audio2Face-3D, or a
     plan (.yaml) of them; puppet, or none, is the model that comes with facediff. Closures, timing, jitter, blinks,

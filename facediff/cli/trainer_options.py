@@ -11,7 +11,7 @@ from typing import Any
 from facediff.errors import ArgumentError
 
 HALF = ("bf16-true", "16-true", "transformer-engine", "transformer-engine-float16")
-"""Lightning's precisions whose weights are of 16 bits."""
+"""Lightning's precisions with weights of 16 bits."""
 
 
 def check_trainer(options: Mapping[str, Any], command: str = "fit") -> None:

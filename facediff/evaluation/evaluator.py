@@ -53,7 +53,7 @@ class EvaluationOptions:
         upper_face: upper-face vertices; needed if a protocol has FDD.
         templates: neutral face (V, 3) by identity; needed if a protocol has FDD.
         n_vertices: vertices V of the mesh.
-        protocols: names of protocols, or protocols of one's own.
+        protocols: names of protocols, or your own protocols.
         metrics: further metrics, each the name of a registered one, which may be followed by options:
             ``temporal_misalignment:at=path,smoothing=1.5``. Their further inputs come from ``corpus``.
         lip_pairs: pairs of inner-lip vertices; the corpus's if None.
@@ -142,7 +142,7 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
     """Score the files of one or several methods against the truth.
 
     Files hold absolute vertices, (T, V, 3) or (T, 3V), of any floating-point type. They are memory-mapped, and of each
-    clip only its scores are kept. The scores are those of :class:`facediff.metrics.ProtocolMetrics` over all clips.
+    clip only its scores are kept. The scores equal :class:`facediff.metrics.ProtocolMetrics` over all clips.
 
     Args:
         methods: folder of predictions by method; the others are compared with the first.
@@ -388,7 +388,7 @@ def scale_of(source: str | None, target: str | None) -> float:
 
 
 def find_protocols(protocols: Sequence[str | Protocol], topology: str | None = None) -> list[Protocol]:
-    """Protocols by name, or one's own; each once."""
+    """Protocols by name, or your own; each once."""
     settings: dict[str, Protocol] = {}
     for name in protocols:
         with errors_of("protocols"):

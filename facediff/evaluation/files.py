@@ -27,7 +27,7 @@ def errors_of(subject: str) -> Iterator[None]:
 # File names: speaker, sentence, and the condition of a prediction.
 
 DEFAULT_PATTERNS = ("{subject}_{sentence}_condition_{identity}", "{subject}_{sentence}")
-"""How predictions are named by default; the first is that of the field's released projects."""
+"""How predictions are named by default; the first is the released projects'."""
 
 TRUTH_PATTERN = "{subject}_{sentence}"  # How truths are named by default
 FIELDS = ("subject", "sentence", "identity")
@@ -94,7 +94,7 @@ def list_names(
 ) -> tuple[dict[Path, Name], list[str]]:
     """The motion files of a folder with the fields of their names, sorted, and the names that no pattern fits.
 
-    Files whose names begin with a dot are ignored.
+    Hidden files are ignored.
     """
     expected = "files of vertices (frames, 3V) or (frames, V, 3)" if len(suffixes) == 1 else "files of parameters"
     deep = any("/" in pattern.pattern for pattern in patterns)
@@ -149,7 +149,7 @@ class Missing:
     # Clips that have no prediction of the conditions asked for.
     without_prediction: list[str] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)  # files under conditions that were not asked for
-    unnamed: list[str] = field(default_factory=list)  # files whose names no pattern fits
+    unnamed: list[str] = field(default_factory=list)  # files that no pattern fits
     # Clip to reason: unreadable files, other meshes, speakers without a template.
     unusable: dict[str, str] = field(default_factory=dict)
 

@@ -17,7 +17,7 @@ def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]
     """The attributes ``by`` of each clip, empty where it has none.
 
     Args:
-        corpus: the corpus folder, whose ``clips.csv`` is read if there is one.
+        corpus: the corpus folder; its ``clips.csv`` is read if there is one.
         names: of the clips' files, without suffix. Those of 3DMEAD (``M003_001_4_1``: emotion, intensity) and of BIWI
             (``F2_e37``, ``F2_37``: emotional or neutral) hold attributes.
         by: which attributes.

@@ -130,7 +130,7 @@ class EvaluationReport:
     lips: Region
     upper_face: Region | None  # upper-face vertices; None if no protocol uses them
     n_vertices: int
-    # The definition of each protocol, by name; under ``metrics`` those of metrics chosen by name.
+    # The definition of each protocol, by name; under ``metrics`` of metrics chosen by name.
     protocols: dict[str, str]
     identity: str  # which conditions were scored
     truth_stride: int  # 2 if every second frame of the truth was taken, and so on
@@ -140,7 +140,7 @@ class EvaluationReport:
     methods: list[MethodResult]  # the results, in the order asked for
     comparisons: list[Comparison]  # every further method against the first
     groups: list[GroupScores]  # scores by the attributes asked for, method by method
-    unnamed_truths: list[str]  # files among the truths whose names do not fit the pattern
+    unnamed_truths: list[str]  # files among the truths that do not fit the pattern
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
     runs: list[Runs] = field(default_factory=list)  # of methods of which several training runs were given
     renders: dict[str, dict[str, float]] = field(default_factory=dict)  # means on renders, by method, and the truth
@@ -388,7 +388,7 @@ Rows = dict[str, dict[str, str]]
 
 
 def _table(rows: Rows, counts: Sequence[str]) -> list[str]:
-    """A table whose last columns are counts."""
+    """A table with counts in the last columns."""
     columns = dict.fromkeys(column for cells in rows.values() for column in cells if column not in counts)
     body = [[row, *(cells.get(column) for column in (*columns, *counts))] for row, cells in rows.items()]
     return format_table(["", *columns, *counts], body).splitlines()

@@ -71,7 +71,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table whose first column is aligned to the left.
+    """A table with the first column aligned to the left.
 
     Attributes:
         head: titles of the columns.

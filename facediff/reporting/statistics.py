@@ -156,7 +156,7 @@ def wilson_interval(wins: float, count: float, level: float = 0.95) -> tuple[flo
 def binomial_interval(wins: float, count: float, level: float = 0.95) -> tuple[float, float]:
     """The exact binomial interval of Clopper and Pearson (1934), which never covers less than its level.
 
-    The arguments are those of :func:`wilson_interval`; half wins, of no difference, are taken as they are.
+    The arguments are as for :func:`wilson_interval`; half wins, of no difference, are taken as they are.
 
     Example:
         >>> [round(end, 4) for end in binomial_interval(89, 120)]

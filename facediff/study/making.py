@@ -78,7 +78,7 @@ def draw(task: VideoTask) -> int:
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """A study whose files have been read and checked, before anything is written.
+    """A study after its files have been read and checked, before anything is written.
 
     Attributes:
         study: its definition.
@@ -317,7 +317,7 @@ class Videos:
         sound: Path | None,
         frames: int,
     ) -> str:
-        """A task without its output, whose name follows from the recipe."""
+        """A task without its output, named by the recipe."""
         files = {path: self._digest(path) for path in (*(motion.path for motion, _ in panels), sound) if path}
         facts = {
             "panels": [[motion.digest(), still, files[motion.path]] for motion, still in panels],

@@ -159,7 +159,7 @@ def serve(
 
 
 def check_folder(folder: Path) -> Study:
-    """The study of a folder whose page and videos are all there."""
+    """The study of a folder with its page and videos."""
     study = read_study(folder)
     page = folder / PAGE_FOLDER
     for path in (page / PAGE, *(page / VIDEO_FOLDER / name for name in study.videos())):

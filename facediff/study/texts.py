@@ -1,4 +1,4 @@
-"""The words of the page, by language, and the questions of a study: bundled ones, and those of a file of the user's."""
+"""The words of the page, by language, and the questions of a study: bundled ones, and a user's file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BUNDLED = {
     "style": Question("style", {}, reference=True),
     "comments": Question("comments", {}, kind="text"),
 }
-"""Questions whose texts are bundled, under ``questions`` in ``assets/texts/*.json``."""
+"""Questions with bundled texts, under ``questions`` in ``assets/texts/*.json``."""
 REMEDY = "docs/user_study.md describes files of questions"
 
 
@@ -51,7 +51,7 @@ def standard(name: str, languages: Sequence[str]) -> dict[str, str]:
 
 
 def bundled_question(name: str, languages: Sequence[str]) -> Question:
-    """A question whose text is bundled."""
+    """A question with a bundled text."""
     question = BUNDLED[name]
     text = {language: bundled_texts()[language]["questions"][name] for language in languages}
     return Question(name, text, question.kind, question.reference, question.no_difference)

@@ -183,7 +183,7 @@ def draw_error(
 ) -> list[str]:
     """Draw how far each vertex is from the truth's, mean or maximum over frames, a column for each method.
 
-    Arguments, result and errors are those of :func:`draw_heatmap`; ``statistic`` is ``mean``, ``max``, or ``both``, a
+    Arguments, result and errors are as for :func:`draw_heatmap`; ``statistic`` is ``mean``, ``max``, or ``both``, a
     row each, and ``highest`` has the ends of the colour scales of mean and maximum.
     """
     rows = {"mean error": "mean", "maximum error": "maximum"}

@@ -75,7 +75,7 @@ def style(paper: Paper) -> Iterator[None]:
 
 
 def new_figure(paper: Paper, height: float, **options: object) -> Figure:
-    """An empty figure of whole pixels, without any of pyplot's state; options are those of matplotlib's ``Figure``."""
+    """An empty figure of whole pixels, without any of pyplot's state; options are matplotlib's for ``Figure``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -233,7 +233,7 @@ class Grid:
         axes.imshow(picture, interpolation="none", aspect="auto", extent=(0, width, 0, height))
 
     def axes(self, left: float, top: float, width: float, height: float) -> Axes:
-        """Axes in a rectangle in mm, whose edges lie on whole pixels."""
+        """Axes in a rectangle in mm, with edges on whole pixels."""
         return self._axes(*(self.paper.pixels(mm) for mm in (left, top, width, height)))
 
     def _axes(self, left: int, top: int, width: int, height: int) -> Axes:
