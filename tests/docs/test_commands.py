@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from facediff.cli.app import COMMANDS, find, load
-from facediff.cli.lightning import check_options, parse_fit
+from facediff.cli.lightning import checked_words, parse_fit
 from facediff.cli.parsing import arguments_of
 from facediff.errors import FaceDiffError
 
@@ -108,7 +108,7 @@ def test_commands_are_understood_by_their_parsers(workplace: Path) -> None:
             continue
         try:
             if words[0] in VERBS:
-                check_options(words[0], words[1:])
+                checked_words(words[0], words[1:])
                 continue
             name, rest = find(words)
             if COMMANDS[name].target.partition(":")[2] not in OWN_PARSERS:
