@@ -268,6 +268,7 @@ DIFFERENT = {
     "frame_rate": "30 or 60 where VOCASET is prepared",
     "low_latency": "steps of a distillation in `adapt`; a flag elsewhere",
     "json": "`evaluate` writes a file; the others print",
+    "scale": "a factor where a video is imported; the measure of a face where one is tracked",
 }
 
 

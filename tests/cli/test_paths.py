@@ -45,7 +45,7 @@ NO_PATHS = {
         "voice_gate",
         "guidance",
     ),
-    *("host", "identities", "layout", "option"),
+    *("host", "identities", "licence", "layout", "option"),
     *("microphone", "sound", "to"),
     *("identity", "kind", "labels", "languages", "license", "push"),
     *(
