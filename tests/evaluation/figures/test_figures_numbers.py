@@ -87,7 +87,7 @@ def test_curves_of_a_run(tmp_path: Path) -> None:
     assert choose_scalars(runs, None) == ["train/loss", "val/lve"]
     with pytest.raises(FaceDiffError, match=r'--scalar: one: there is no scalar "val/lvee".*did you mean "val/lve"'):
         choose_scalars(runs, ["val/lvee"])
-    with pytest.raises(FaceDiffError, match="choose with --scalar: known are lr"):
+    with pytest.raises(FaceDiffError, match="known are lr"):
         choose_scalars({"one": {"lr": curves["lr"]}}, None)
 
 
