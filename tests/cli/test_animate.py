@@ -145,7 +145,7 @@ def test_bad_options(
         ("-o x.gif", 'there is no format ".gif"'),
         ("--window 0.1", "too few frames"),
         ("--expressiveness chin=2", "chin"),
-        ("--blinks", "--blinks: needs to know where lids and eyeballs are"),
+        ("--blinks", "--blinks: lids and eyeballs of this face are not known"),
         ("--rate 8000", "--rate: has no effect without --stream"),
         ("--retry-failed", "--retry-failed: is for several recordings"),
     ):
