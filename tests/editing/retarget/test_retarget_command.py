@@ -161,7 +161,7 @@ def test_plain_materials_of_a_glb_colour_what_is_no_glb(
     file.content |= {"meshes": [{"primitives": primitives}], "nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}]}
     file.write(tmp_path / "own.glb")
     assert main(["retarget", "take.npz", "--target-mesh", "own.glb", "-o", "out.npz"]) == 0
-    assert "of own.glb, the colours of materials are kept as those of vertices" in capsys.readouterr().out
+    assert "of own.glb, the colours of materials are kept as vertex colours" in capsys.readouterr().out
     colours = read_archive(tmp_path / "out.npz").colours
     assert colours is not None
     assert np.unique(colours[:-9], axis=0).tolist() == [[188, 128, 0]], "sRGB of the linear factor"
