@@ -45,10 +45,10 @@ class Channels:
     """Channels of a parametric space that an animation's vertices were made of.
 
     Attributes:
-        space: what they mean.
+        space: their meaning.
         values: (T, C) float32, finite.
-        vertices: the animation's array of vertices. Whatever changes the vertices makes another array, with which the
-            channels have nothing to do any more.
+        vertices: the animation's array of vertices. A change of the vertices makes another array, which the
+            channels do not belong to.
         deltas: (K, V, 3) float32, what each channel of :attr:`Space.face` moves the vertices by at 1, the head aside;
             None if the vertices are no weighted sum.
     """
@@ -80,7 +80,7 @@ class Animation:
         inner_lip_pairs: (P, 2) upper and lower vertices of the inner lips, for the mouth's opening; None if unknown.
         head: (T, 6) how the head moves as a whole, if it does: a rotation about the origin, axis-angle in radians, and
             then a shift; the vertices have been moved by it, see :meth:`still`.
-        channels: what the vertices were made of, where that is channels of a parametric space; see :attr:`values`.
+        channels: of a parametric space that the vertices were made of, if any; see :attr:`values`.
         metadata: text about how it was made: identity, style, what in it is procedural …
 
     Example:
@@ -138,12 +138,12 @@ class Animation:
     @property
     def values(self) -> npt.NDArray[np.float32] | None:
         """The channels (T, C) that the vertices were made of; None if there are none, or the vertices were changed."""
-        known = self.channels is not None and self.channels.vertices is self.vertices
-        return self.channels.values if known and self.channels is not None else None
+        unchanged_vertices = self.channels is not None and self.channels.vertices is self.vertices
+        return self.channels.values if unchanged_vertices and self.channels is not None else None
 
     @property
     def space(self) -> Space:
-        """What :attr:`values` mean; that of vertices where there are none."""
+        """Meaning of :attr:`values`; vertices where there are none."""
         return VERTICES if self.values is None or self.channels is None else self.channels.space
 
     @property
@@ -159,7 +159,7 @@ class Animation:
     def made_of(
         self, space: Space, values: npt.NDArray[np.float32], deltas: npt.NDArray[np.floating] | None = None
     ) -> Self:
-        """The same with the channels that its vertices were made of; the arguments are those of :class:`Channels`."""
+        """The same with the channels that its vertices were made of; with the arguments of :class:`Channels`."""
         shapes = None if deltas is None else np.asarray(deltas, np.float32)
         return replace(self, channels=Channels(space, values, self.vertices, shapes))
 
@@ -283,7 +283,7 @@ class Animation:
         return animation
 
     def drive(self, avatar: str | Path, path: str | Path) -> list[Path]:
-        """Write a copy of an avatar whose own shapes and bones play the motion.
+        """Write a copy of an avatar that plays the motion by its own shapes and bones.
 
         Args:
             avatar: a .glb with shapes under names of ARKit, Oculus or VRM. Weights go by name where the motion has
@@ -310,7 +310,7 @@ class Animation:
 
         Args:
             shapes: folder of .obj or .ply files named jawOpen, mouthFunnel …, a .glb with named targets, or ``puppet``
-                for those of the built-in face.
+                for the built-in face's.
             carry: the shapes are of another topology: transfer them to this mesh.
             smoothness: cost of change over time; 0 is off.
             symmetry: cost of a difference between left and right; 0 is off.
@@ -318,7 +318,7 @@ class Animation:
             bounds: least and greatest weight.
             region: look at a region of the face only, such as ``lips``.
             residual_limit: share of the motion that weights may leave before they are refused.
-            only_arkit: leave out shapes whose names are not ARKit's.
+            only_arkit: leave out shapes without ARKit's names.
         """
         return late(f"{MOTION}:blendshapes")(
             self,
@@ -335,7 +335,7 @@ class Animation:
         )
 
     def _repr_html_(self) -> str | None:
-        """What a notebook shows: the face, which plays; nothing but the text where there is no mesh."""
+        """The face, playing in a notebook; None without a mesh, for the text alone."""
         text: str | None = late(f"{MOTION}:Page")([self])._repr_html_()
         return text
 

@@ -49,7 +49,7 @@ OF_TOPOLOGY = ("template", "faces", "colours", "inner_lip_pairs")
 
 
 class AnimationFacts(TypedDict, total=False):
-    """What a bare array of vertices lacks, as the fields of :class:`Animation`; any of them may be missing."""
+    """Facts that a bare array of vertices lacks, as the fields of :class:`Animation`; any of them may be missing."""
 
     template: npt.NDArray[np.float32]
     faces: npt.NDArray[np.int32]
@@ -70,8 +70,8 @@ def read_animation(
     Args:
         path: ``.npz`` as :func:`facediff.animation.write_archive` writes it, or ``.npy`` of absolute vertices (T, V, 3)
             or (T, 3V). Without a template an array's first frame is used as the neutral face.
-        overrides: facts that take precedence over those of an archive.
-        defaults: facts that neither the file nor ``overrides`` have; those of another topology only if they hold for
+        overrides: facts that take precedence over an archive's.
+        defaults: facts that neither the file nor ``overrides`` have; of another topology only where they hold for
             any.
     """
     overrides = overrides or {}
@@ -92,7 +92,7 @@ def read_animation(
 
 
 def _named(path: Path, make: Callable[[], T]) -> T:
-    """What a function makes of a file; errors name the file instead of the animation."""
+    """The result of a function; errors name the file instead of the animation."""
     try:
         return make()
     except FaceDiffError as error:
@@ -111,16 +111,16 @@ def facts_of(animation: Animation) -> AnimationFacts:
 
 
 def complete(facts: AnimationFacts, defaults: AnimationFacts | None) -> AnimationFacts:
-    """Facts together with those of others that are missing: of another topology, the frame rate and the unit only."""
+    """Facts, completed by others: of another topology, the frame rate and the unit only."""
     if defaults is None:
         return facts
     alike = (
         "template" not in facts or "template" not in defaults or facts["template"].shape == defaults["template"].shape
     )
     names = ("frame_rate", "unit", *(OF_TOPOLOGY if alike else ()))
-    found: dict[str, Any] = {name: defaults[name] for name in names if defaults.get(name) is not None}  # type: ignore[literal-required]
+    shared_facts: dict[str, Any] = {name: defaults[name] for name in names if defaults.get(name) is not None}  # type: ignore[literal-required]
     regions = {**(defaults.get("regions", {}) if alike else {}), **facts.get("regions", {})}
-    return {**found, **facts, "regions": regions}  # type: ignore[typeddict-item]
+    return {**shared_facts, **facts, "regions": regions}  # type: ignore[typeddict-item]
 
 
 def write_archive(path: Path, animation: Animation) -> None:
@@ -151,9 +151,9 @@ def read_archive(path: Path) -> Animation:
     """Read a file of :func:`write_archive`."""
     expected = "expected an animation that `facediff animate … -o hello.npz` wrote"
     arrays = read_arrays(path, _Entries())
-    missing = [name for name in ("vertices", "template", "about") if name not in arrays]
-    if missing:
-        raise FaceDiffError(f"{path}: has no {', '.join(missing)}; {expected}")
+    absent_entries = [name for name in ("vertices", "template", "about") if name not in arrays]
+    if absent_entries:
+        raise FaceDiffError(f"{path}: has no {', '.join(absent_entries)}; {expected}")
     facts = _about(arrays.pop("about"), f"{path}: its entry about")
     count = len(np.atleast_1d(arrays["template"]))
     checked = {name: _checked(path, name, array, count) for name, array in arrays.items()}
@@ -196,19 +196,21 @@ def _about(array: npt.NDArray[Any], source: str) -> dict[str, Any]:
 
 def _checked(path: Path, name: str, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """One array of an archive in the type that :class:`Animation` has; indices name one of ``count`` vertices."""
-    kinds, words, lengths, wanted = ARRAYS.get(name, REGION)
+    kinds, expectation, lengths, number_type = ARRAYS.get(name, REGION)
     remedy = "write the file again"
     fits = array.ndim == len(lengths) and all(
-        length in (None, found) for found, length in zip(array.shape, lengths, strict=True)
+        length in (None, size) for size, length in zip(array.shape, lengths, strict=True)
     )
     if not array.size and name not in ("vertices", "template"):
-        return np.zeros([length or 0 for length in lengths], wanted)  # an empty array may have any shape
+        return np.zeros([length or 0 for length in lengths], number_type)  # an empty array may have any shape
     last = 255 if name == "colours" else count - 1
     fits = fits and array.dtype.kind in kinds and (kinds == "f" or 0 <= array.min() <= array.max() <= last)
     if not fits:
-        raise FaceDiffError(f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {words}; {remedy}")
+        raise FaceDiffError(
+            f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {expectation}; {remedy}"
+        )
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
-        return array.astype(wanted, copy=False)
+        return array.astype(number_type, copy=False)
 
 
 class MotionWriter:

@@ -207,8 +207,8 @@ class AnimationControls(CheckedOptions):
     acting: Annotated[str | None, Option(metavar="ACTING")] = None
 
     def __post_init__(self) -> None:
-        usual = {"blinks": ranges.USUAL_BLINKS, "gaze": ranges.USUAL_GAZE, "sway": ranges.USUAL_SWAY}
-        for name, number in usual.items():
+        defaults = {"blinks": ranges.USUAL_BLINKS, "gaze": ranges.USUAL_GAZE, "sway": ranges.USUAL_SWAY}
+        for name, number in defaults.items():
             if isinstance(switch := getattr(self, name), bool):
                 object.__setattr__(self, name, number if switch else None)
         super().__post_init__()
@@ -357,7 +357,7 @@ class AnimationOptions(
             >>> AnimationOptions(checkpoint="puppet.ckpt", blinks=True, acting="prosody", seed=3).words()
             ['--blinks', '17', '--acting', 'prosody']
         """
-        words = []
+        arguments = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name in NAMED_ELSEWHERE or value == field.default:
@@ -366,8 +366,8 @@ class AnimationOptions(
                 value = ",".join(f"{name}={share:.15g}" for name, share in value.items())
             elif isinstance(value, float):
                 value = f"{value:.15g}"
-            words += [f"--{field.name.replace('_', '-')}", *([] if value is True else [str(value)])]
-        return words
+            arguments += [f"--{field.name.replace('_', '-')}", *([] if value is True else [str(value)])]
+        return arguments
 
 
 NAMED_ELSEWHERE = (
@@ -406,7 +406,7 @@ def with_options(options: type, keywords: type) -> Callable[[Function], Function
     def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
         plain = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        shown = [
+        parameters = [
             inspect.Parameter(
                 name, inspect.Parameter.KEYWORD_ONLY, default=fields[name].default, annotation=hints[name]
             )
@@ -416,13 +416,13 @@ def with_options(options: type, keywords: type) -> Callable[[Function], Function
         entries = "".join(f"    {name}: {texts[name]}.\n" for name in names)
 
         @functools.wraps(function)
-        def call(*arguments: Any, **given: Any) -> Any:  # noqa: ANN401
-            for name in given:
+        def call(*arguments: Any, **keywords: Any) -> Any:  # noqa: ANN401
+            for name in keywords:
                 if name not in names and name not in signature.parameters:
                     raise TypeError(f"{function.__name__}() has no option {name!r}: {choices(name, names)}")
-            return function(*arguments, **given)
+            return function(*arguments, **keywords)
 
-        vars(call)["__signature__"] = signature.replace(parameters=[*plain, *shown])
+        vars(call)["__signature__"] = signature.replace(parameters=[*plain, *parameters])
         call.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\nOptions:\n{entries}"
         return call  # type: ignore[return-value]
 

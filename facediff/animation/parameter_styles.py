@@ -28,7 +28,7 @@ def recorded_parameters(source: str, frame_rate: float) -> ParameterClip | None:
 
     Args:
         source: a file, with ``@`` and its layout if it does not say that itself.
-        frame_rate: frames a second of an array whose layout has no rate of its own.
+        frame_rate: frames a second of an array, if its layout has no rate.
     """
     path, stated = with_layout(source)
     if path.suffix not in PARAMETER_FILES or (stated is None and not path.is_file()):
@@ -63,9 +63,11 @@ def channels_of(recorded: ParameterClip, space: Space, frame_rate: float) -> npt
             f"{{style}} {recorded.name}: is motion in parameters, and this model takes vertices; give such a motion"
         )
     recorded = even(recorded)  # an app drops rows
-    values, own = permuted(recorded.values, recorded.space, space)
+    values, ordered_space = permuted(recorded.values, recorded.space, space)
     unrecorded = {*space.channels} - {*layout("live_link").channels} if space.kind == "arkit" else set()
-    lacking = [name for name in own.absent if name in space.channels and name not in {*space.absent, *unrecorded}]
+    lacking = [
+        name for name in ordered_space.absent if name in space.channels and name not in {*space.absent, *unrecorded}
+    ]
     if lacking:
         raise OptionError.naming(
             f"{{style}} {recorded.name}: lacks {', '.join(lacking[:4])}{' …' if len(lacking) > 4 else ''}; give a "

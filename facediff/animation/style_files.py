@@ -1,4 +1,4 @@
-"""What is typed after ``--style``, and the files among it: mixtures of names with weights, motions, style vectors.
+"""The text of ``--style``, and its files: mixtures of names with weights, motions, style vectors.
 
 For models with and without PyTorch alike. Libraries are imported inside the functions, so that splitting alone costs
 nothing.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FILES = (".npy", ".npz")
 """Suffixes of files that hold a style; anything else is the name of a clip."""
 CANCELLED = 1e-3
-"""Weights whose sum is less than this share of their sizes have nothing left to divide by."""
+"""Weights that sum to less than this share of their sizes leave nothing to divide by."""
 OTHER_FACE = 0.25
 """How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
 OTHER_ENCODER = 0.1
@@ -45,8 +45,8 @@ class Weighted:
     weight: float | None
 
 
-def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
-    r"""The styles of a mixture, split at commas; a weight is what follows the last colon, if that is a number.
+def split_styles(text: str, clips: Sequence[str] = ()) -> list[Weighted]:
+    r"""The styles of a mixture, split at commas; a weight follows the last colon, if it is a number.
 
     Words that are a file, or the name of a clip, as a whole are taken as such: alone, a name may hold commas, or end in
     a colon and a number.
@@ -55,17 +55,17 @@ def split_styles(words: str, clips: Sequence[str] = ()) -> list[Weighted]:
     [Weighted(name='C:\\ann\\x.npy', weight=0.3), Weighted(name='F1_e05', weight=-1.0)]
     """
     # Before anything is split: a file or clip may have commas and colons in its name.
-    if words in clips or Path(words).is_file():
-        return [Weighted(words, None)]
+    if text in clips or Path(text).is_file():
+        return [Weighted(text, None)]
     parts = []
-    for word in words.split(","):
-        found = re.fullmatch(rf"(.*):\s*({NUMBER})\s*", word, re.IGNORECASE)
-        name = (found[1] if found else word).strip()
+    for word in text.split(","):
+        match = re.fullmatch(rf"(.*):\s*({NUMBER})\s*", word, re.IGNORECASE)
+        name = (match[1] if match else word).strip()
         if not name:
             raise OptionError.naming(
-                f"{{style}} {words}: expected names or files with weights, such as a.npy:0.3,b.npy:0.7"
+                f"{{style}} {text}: expected names or files with weights, such as a.npy:0.3,b.npy:0.7"
             )
-        parts.append(Weighted(name, float(found[2]) if found else None))
+        parts.append(Weighted(name, float(match[2]) if match else None))
     return parts
 
 
@@ -79,27 +79,27 @@ def with_layout(word: str) -> tuple[Path, str | None]:
     return (Path(name), layout) if at and name and not Path(word).is_file() else (Path(word), None)
 
 
-def style_paths(words: str | None) -> list[Path]:
+def style_paths(text: str | None) -> list[Path]:
     """The files among the words of ``--style``; if one of them has changed, so has the style."""
-    paths = [with_layout(part.name)[0] for part in split_styles(words)] if words else []
+    paths = [with_layout(part.name)[0] for part in split_styles(text)] if text else []
     return [path for path in paths if path.is_file()]
 
 
-def normalised(words: str, weights: Sequence[float | None]) -> list[float]:
+def normalised(text: str, weights: Sequence[float | None]) -> list[float]:
     """Weights that sum to 1; a note is printed if that changed them."""
-    given = [weight for weight in weights if weight is not None]
-    if not given:
+    numbers = [weight for weight in weights if weight is not None]
+    if not numbers:
         return [1.0 / len(weights)] * len(weights)
-    if len(given) < len(weights):
-        raise OptionError.naming(f"{{style}} {words}: give every style a weight (A:0.3,B:0.7), or none of them")
-    total = math.fsum(given)
+    if len(numbers) < len(weights):
+        raise OptionError.naming(f"{{style}} {text}: give every style a weight (A:0.3,B:0.7), or none of them")
+    total = math.fsum(numbers)
     # Weights may be negative (to lead away from a style), so their sum may cancel to almost nothing; the mixture, which
     # is divided by it, would be huge.
-    if not all(map(math.isfinite, given)) or not abs(total) > CANCELLED * math.fsum(map(abs, given)):
+    if not all(map(math.isfinite, numbers)) or not abs(total) > CANCELLED * math.fsum(map(abs, numbers)):
         raise OptionError.naming(
-            f"{{style}} {words}: expected finite weights whose sum is not 0, since they are divided by it"
+            f"{{style}} {text}: expected finite weights with a sum other than 0, since they are divided by it"
         )
-    shares = [weight / total for weight in given]
+    shares = [weight / total for weight in numbers]
     if abs(total - 1.0) > 1e-6:
         print(f"note: --style: weights are divided by their sum: {', '.join(f'{share:.3g}' for share in shares)}")
     return shares
@@ -125,7 +125,7 @@ class StyleFile:
 
 
 def style_given(style: object, *, vertices: bool) -> str | ParameterClip | StyleFile:
-    """What a style was given as in Python: the words of ``--style``, motion in parameters, or what a file would hold.
+    """A style as it was given in Python: the text of ``--style``, motion in parameters, or the content of a file.
 
     Args:
         style: words; a path; names or paths with their weights; an animation, an array of motion or a vector.
@@ -186,7 +186,7 @@ def vector_in(
 ) -> npt.NDArray[np.float32]:
     """The style vector (S,) of a file that holds one, alone or as :func:`marked` with its encoder's answer.
 
-    Of a vector alone nobody can say whose it is.
+    A vector alone does not tell its model.
 
     Args:
         opened: the file.
@@ -205,11 +205,11 @@ def vector_in(
             f"{name}: holds {len(vector)} numbers, but this model's style vectors have {width} (no NaN); {remedy}"
         )
     if divided and still is not None:
-        answer, own = values[middle + 1 :], still()
-        limit = OTHER_ENCODER * max(np.linalg.norm(answer), np.linalg.norm(own))
-        if not np.linalg.norm(answer - own) <= limit:
+        answer, model_answer = values[middle + 1 :], still()
+        limit = OTHER_ENCODER * max(np.linalg.norm(answer), np.linalg.norm(model_answer))
+        if not np.linalg.norm(answer - model_answer) <= limit:
             raise OptionError.naming(
-                f"{name}: is of another model, whose style encoder gives other numbers for a still face; {remedy}"
+                f"{name}: is of another model: its style encoder gives other numbers for a still face; {remedy}"
             )
     return vector
 
@@ -236,12 +236,12 @@ def frames_of(opened: StyleFile, vertices: int, stride: int) -> npt.NDArray[np.f
     return motion
 
 
-def stride_of(path: Path, stored: float, wanted: float) -> int:
+def stride_of(path: Path, stored: float, frame_rate: float) -> int:
     """Every how many-th frame of a file is taken."""
-    stride = round(stored / wanted)
-    if stride < 1 or abs(stride * wanted - stored) > 1e-6:
+    stride = round(stored / frame_rate)
+    if stride < 1 or abs(stride * frame_rate - stored) > 1e-6:
         raise OptionError.naming(
-            f"{{style}} {path}: has {stored:g} frames a second, the model {wanted:g}; give a motion at that rate"
+            f"{{style}} {path}: has {stored:g} frames a second, the model {frame_rate:g}; give a motion at that rate"
         )
     return stride
 

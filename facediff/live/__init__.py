@@ -1,6 +1,6 @@
 """Live performance: a face animated from live speech, in engines, browsers and other programs.
 
-Needs no PyTorch: what animates is an exported model (:mod:`facediff.runtime`), or whatever gives frames for speech.
+Needs no PyTorch: an exported model (:mod:`facediff.runtime`) animates, or any other source of frames for speech.
 """
 
 from typing import TYPE_CHECKING

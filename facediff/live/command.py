@@ -1,4 +1,4 @@
-"""A live performance from the first check to the report at its end, whichever model animates."""
+"""A live performance from the first check to the report at its end, with any model."""
 
 from __future__ import annotations
 
@@ -107,14 +107,14 @@ def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:
 @contextmanager
 def opened(receivers: Sequence[Receiver], performance: Performance) -> Iterator[None]:
     """Receivers that are open for as long as the context lasts, and all closed after it."""
-    begun: list[Receiver] = []
+    outputs: list[Receiver] = []
     try:
         for opening in receivers:
-            begun.append(opening)
+            outputs.append(opening)
             opening.open(performance)
         yield
     finally:
-        for closing in reversed(begun):
+        for closing in reversed(outputs):
             closing.close()
 
 

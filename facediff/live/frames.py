@@ -43,7 +43,7 @@ class LiveFrame:
             receiver needs them.
         dropped: frames that were dropped so far, before this one.
         head: how the head moves as a whole (6,), if controls or acting move it: a rotation about the origin, axis-angle
-            in radians, and then a shift. The vertices have been moved by it; the weights are those of the face without.
+            in radians, and then a shift. The vertices have been moved by it; the weights leave the head out.
     """
 
     index: int
@@ -104,7 +104,7 @@ class Address:
         host: of ``scheme://host:port``; None if not given.
         port: of ``scheme://host:port`` or ``scheme:port``; None if not given.
         path: what else follows the scheme: a file, or ``-``; empty if nothing does.
-        options: what follows the question mark.
+        options: after the question mark.
     """
 
     text: str
@@ -134,15 +134,15 @@ class Receiver(ABC):
         self.address = address
         self.name = address.text
 
-    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+    def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
         """Let every constructor refuse options that are out of range."""
-        super().__init_subclass__(**words)
+        super().__init_subclass__(**options)
         if "__init__" in vars(cls):
             cls.__init__ = checks_arguments(cls.__init__, "receiver")  # type: ignore[method-assign]
 
     @abstractmethod
     def open(self, performance: Performance) -> None:
-        """Open what the performance is sent through: a socket, a file, a server.
+        """Open the way to the receiver: a socket, a file, a server.
 
         A program that does not listen yet is no error: every frame is sent to it.
         """
@@ -229,7 +229,7 @@ def open_receiver(text: str) -> Receiver:
 
 def open_receivers(texts: Sequence[str]) -> list[Receiver]:
     """The receivers at several addresses, none of which is given twice."""
-    for place, text in enumerate(texts):
-        if text in texts[:place]:
+    for number, text in enumerate(texts):
+        if text in texts[:number]:
             raise FaceDiffError(f"{OPTION} {text}: is given twice; give every receiver once")
     return [open_receiver(text) for text in texts]

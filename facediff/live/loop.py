@@ -88,7 +88,7 @@ class LiveSummary:
 
 
 def dropped_text(frames: int, speech: float) -> str:
-    """What was dropped, said alike while a performance runs and at its end.
+    """A sentence about dropped speech and frames, for the run and its end.
 
     Args:
         frames: that came too late to be sent, or were left out.
@@ -98,7 +98,7 @@ def dropped_text(frames: int, speech: float) -> str:
 
 
 class Backlog:
-    """Speech that waits for the model; what is too much is dropped at its oldest end, in whole frames.
+    """Speech that waits for the model; the excess is dropped at its oldest end, in whole frames.
 
     Args:
         frame_rate: of the motion.
@@ -119,7 +119,7 @@ class Backlog:
         with self._changed:
             self._pieces.append(samples)
             self._waiting += len(samples)
-            # Half of what is allowed is left, so that there are few gaps rather than many.
+            # Half of the limit is left, so that there are few gaps rather than many.
             if self._waiting > self.limit * SAMPLE_RATE:
                 self._drop(self._waiting - round(self.limit / 2 * SAMPLE_RATE))
             self._changed.notify()
@@ -134,9 +134,9 @@ class Backlog:
         frames = math.floor(least * self.frame_rate / SAMPLE_RATE)
         # Counted from the start, so that frames which are no whole number of samples do not add up to an error.
         samples = samples_for(self.dropped + frames, self.frame_rate) - samples_for(self.dropped, self.frame_rate)
-        kept = np.concatenate(self._pieces)[samples:]
-        self._pieces = deque([kept])
-        self._waiting = len(kept)
+        remainder = np.concatenate(self._pieces)[samples:]
+        self._pieces = deque([remainder])
+        self._waiting = len(remainder)
         self.dropped += frames
 
     def end(self) -> None:
@@ -145,22 +145,22 @@ class Backlog:
             self._ended = True
             self._changed.notify()
 
-    def take(self, most: float) -> tuple[Speech, int] | None:
+    def take(self, limit: float) -> tuple[Speech, int] | None:
         """Wait for speech, and take it: samples, and how many frames were dropped before them; None at the end.
 
         Args:
-            most: seconds that are taken at most.
+            limit: seconds that are taken at most.
         """
         with self._changed:
             while not self._waiting and not self._ended:
                 self._changed.wait()
             if not self._waiting:
                 return None
-            whole = np.concatenate(self._pieces)
-            count = min(len(whole), max(1, round(most * SAMPLE_RATE)))
-            self._pieces = deque([whole[count:]]) if count < len(whole) else deque()
+            speech = np.concatenate(self._pieces)
+            count = min(len(speech), max(1, round(limit * SAMPLE_RATE)))
+            self._pieces = deque([speech[count:]]) if count < len(speech) else deque()
             self._waiting -= count
-            return whole[:count], self.dropped
+            return speech[:count], self.dropped
 
 
 @dataclass(frozen=True)
@@ -182,11 +182,11 @@ class Loop:
         model: animates.
         source: of the speech.
         receivers: of the frames; they are open, and closed by the caller.
-        hearing: those of them that play the speech.
+        hearing: the receivers that play the speech.
         solve: finds weights of blendshapes for receivers that need them; None to send those that the model gives.
         seconds: of speech, after which it ends; None for the source's own end.
         report: prints a sentence.
-        every: seconds between reports; None for none but that of a slow model.
+        every: seconds between reports; None for reports of a slow model alone.
     """
 
     def __init__(
@@ -241,7 +241,7 @@ class Loop:
         return self.summary
 
     def _guard(self, work: Callable[[], None]) -> Callable[[], None]:
-        """A thread's work, whose error ends the performance and is raised where it was started."""
+        """A thread's work; its error ends the performance and is raised where it was started."""
 
         def guarded() -> None:
             try:
@@ -261,23 +261,23 @@ class Loop:
 
     def _listen(self) -> None:
         """Take speech from the source."""
-        heard, most = 0, math.inf if self._seconds is None else round(self._seconds * SAMPLE_RATE)
+        sample_count, limit = 0, math.inf if self._seconds is None else round(self._seconds * SAMPLE_RATE)
 
         def deliver(samples: Speech, at: float) -> None:
-            nonlocal heard
-            samples = samples[: int(min(len(samples), most - heard))]
+            nonlocal sample_count
+            samples = samples[: int(min(len(samples), limit - sample_count))]
             if not len(samples) or self._stopped.is_set():
                 return
-            start, heard = heard / SAMPLE_RATE, heard + len(samples)
+            start, sample_count = sample_count / SAMPLE_RATE, sample_count + len(samples)
             with self._changed:
-                self.clock.arrived(heard / SAMPLE_RATE, at)
-                self.summary.speech = heard / SAMPLE_RATE
+                self.clock.arrived(sample_count / SAMPLE_RATE, at)
+                self.summary.speech = sample_count / SAMPLE_RATE
                 if self.hearing:
                     self._spoken.append((samples, start))
                     self._changed.notify()
             self._relieve()
             self._backlog.put(samples)
-            if heard >= most:
+            if sample_count >= limit:
                 self._stopped.set()
                 self._backlog.end()  # the source may wait long before it notices
 
@@ -294,45 +294,45 @@ class Loop:
     def _animate(self) -> None:
         """Turn speech into frames."""
         stream = self.model.start()
-        fed, ready = 0, 0  # samples, and frames of the stream, which does not know of what was dropped
+        fed, frame_count = 0, 0  # samples, and frames of the stream, which does not know of dropped ones
         gaps: deque[tuple[int, int]] = deque([(0, 0)])  # from which frame of the stream on how many were dropped before
         recent: deque[tuple[float, float]] = deque()  # seconds of computing, seconds of speech
-        while (taken := self._backlog.take(max(self.model.hop, 0.02))) is not None and not self._abandoned:
-            samples, dropped = taken
+        while (piece := self._backlog.take(max(self.model.hop, 0.02))) is not None and not self._abandoned:
+            samples, dropped = piece
             if dropped != gaps[-1][1]:
                 gaps.append((math.ceil(fed * self.model.frame_rate / SAMPLE_RATE), dropped))
                 self.summary.lost = dropped / self.model.frame_rate
             before, began = stream.made, time.monotonic()
             points = stream.feed(samples)
-            now = time.monotonic()
+            timestamp = time.monotonic()
             fed += len(samples)
             if stream.made > before:
-                self.summary.computing.add(now - began)
-            recent.append((now - began, len(samples) / SAMPLE_RATE))
+                self.summary.computing.add(timestamp - began)
+            recent.append((timestamp - began, len(samples) / SAMPLE_RATE))
             self._measure(recent)
-            ready = self._ready(points, stream.heads, ready, gaps, now)
+            frame_count = self._ready(points, stream.heads, frame_count, gaps, timestamp)
         if fed and not self._abandoned:
             self._thinning.stride = 1  # nothing waits any more, and the last frame shuts the mouth
             before, began = stream.made, time.monotonic()
             points = stream.finish()
-            now = time.monotonic()
-            self.summary.busy += now - began
+            timestamp = time.monotonic()
+            self.summary.busy += timestamp - began
             if stream.made > before:
-                self.summary.computing.add(now - began)
-            self._ready(points, stream.heads, ready, gaps, now)
+                self.summary.computing.add(timestamp - began)
+            self._ready(points, stream.heads, frame_count, gaps, timestamp)
 
     def _measure(self, recent: deque[tuple[float, float]]) -> None:
         """Find out whether the model is fast enough; if not, little speech may wait for it once frames are left out."""
-        computed, heard = recent[-1][0], sum(speech for _, speech in recent)
+        computed, seconds_of_speech = recent[-1][0], sum(speech for _, speech in recent)
         self.summary.busy += computed
         hop = self.model.hop
         enough = max(RECENT, 2 * hop)
-        while heard - recent[0][1] > enough:
-            heard -= recent.popleft()[1]
+        while seconds_of_speech - recent[0][1] > enough:
+            seconds_of_speech -= recent.popleft()[1]
         # A process that was stopped for a while has one long window: it counts as the next longest.
         longest = sorted((seconds for seconds, _ in recent), reverse=True)
-        factor = (sum(longest) - longest[0] + longest[min(1, len(longest) - 1)]) / max(heard, 1e-9)
-        self._slow = heard > 0.9 * enough and factor > 1
+        factor = (sum(longest) - longest[0] + longest[min(1, len(longest) - 1)]) / max(seconds_of_speech, 1e-9)
+        self._slow = seconds_of_speech > 0.9 * enough and factor > 1
         if self._slow and not self._slow_reported:
             self._slow_reported = True
             self._report(
@@ -347,7 +347,7 @@ class Loop:
         heads: npt.NDArray[np.float64] | None,
         first: int,
         gaps: deque[tuple[int, int]],
-        now: float,
+        timestamp: float,
     ) -> int:
         """Queue frames of the stream, the first of which has the number ``first``; the number of the next."""
         if not len(points):
@@ -356,15 +356,15 @@ class Loop:
         values = [None] * len(points) if decoder is None else decoder.values(points)
         offsets = (points if decoder is None else decoder.vertices(points)) - self.model.neutral
         with self._changed:
-            for place, frame_offsets in enumerate(offsets):
-                while len(gaps) > 1 and gaps[1][0] <= first + place:
+            for row, frame_offsets in enumerate(offsets):
+                while len(gaps) > 1 and gaps[1][0] <= first + row:
                     gaps.popleft()
-                index = first + place + gaps[0][1]
-                spoken = self.clock.spoken((index + 1) / self.model.frame_rate)
-                if place == 0:
-                    self.pacer.ready(spoken, now)
-                head = None if heads is None else heads[place]
-                self._frames.append(_Ready(index, spoken, now, frame_offsets, values[place], head))
+                index = first + row + gaps[0][1]
+                speech_time = self.clock.spoken((index + 1) / self.model.frame_rate)
+                if row == 0:
+                    self.pacer.ready(speech_time, timestamp)
+                head = None if heads is None else heads[row]
+                self._frames.append(_Ready(index, speech_time, timestamp, frame_offsets, values[row], head))
             self._changed.notify()
         return first + len(points)
 
@@ -423,7 +423,7 @@ class Loop:
         return bool(newer) and time.monotonic() > self.pacer.due(frame.spoken) + self.model.hop
 
     def _still(self, frame: _Ready) -> Array:
-        """Offsets of a frame's vertices whose head does not move as a whole, which shapes of a face cannot say."""
+        """Offsets of a frame's vertices without the motion of the head, which shapes of a face cannot express."""
         if frame.head is None or not frame.head.any():
             return frame.vertices  # to the last bit
         neutral = self.model.neutral
@@ -442,12 +442,12 @@ class Loop:
             head=frame.head,
         )
         self._each(self.receivers, lambda receiver: receiver.send(out))
-        now = time.monotonic()
+        timestamp = time.monotonic()
         self.summary.frames += 1
-        self.summary.lag.add(now - frame.spoken)
-        self._interval.add(now - frame.spoken)
+        self.summary.lag.add(timestamp - frame.spoken)
+        self._interval.add(timestamp - frame.spoken)
         self.summary.waiting.add(began - frame.ready)
-        self.summary.sending.add(now - began + solving)
+        self.summary.sending.add(timestamp - began + solving)
 
     def _each(self, receivers: Sequence[Receiver], do: Callable[[Receiver], None]) -> None:
         """Do something with every receiver; one that fails, which none should, does not end the others."""

@@ -91,12 +91,12 @@ def usual_gate(look_ahead: float) -> str:
         >>> usual_gate(0.2)
         'energy:attack=0.085,lead=0.085,ahead=0'
     """
-    usual = EnergyGate()
-    free = look_ahead - 0.03  # the gate decides in steps of 10 ms
-    if free >= usual.ahead + usual.attack + usual.lead:
+    gate = EnergyGate()
+    margin = look_ahead - 0.03  # the gate decides in steps of 10 ms
+    if margin >= gate.ahead + gate.attack + gate.lead:
         return USUAL_GATE
     # A mouth that opens late is worse than a gate that does not know the noise yet: the opening goes first.
-    attack = min(usual.attack, max(0.0, free / 2))
-    lead = min(usual.lead, max(0.0, free - attack))
-    ahead = min(usual.ahead, max(0.0, free - attack - lead))
+    attack = min(gate.attack, max(0.0, margin / 2))
+    lead = min(gate.lead, max(0.0, margin - attack))
+    ahead = min(gate.ahead, max(0.0, margin - attack - lead))
     return f"{USUAL_GATE}:attack={attack:.4g},lead={lead:.4g},ahead={ahead:.4g}"

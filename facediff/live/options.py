@@ -63,8 +63,8 @@ class LiveOptions(CheckedOptions):
     @property
     def plays(self) -> str:
         """Where speech is played; nowhere for a microphone, which playing would feed back."""
-        usual = RECEIVERS if self.speech not in (None, "-") else OFF
-        return usual if self.sound is None else self.sound
+        default = RECEIVERS if self.speech not in (None, "-") else OFF
+        return default if self.sound is None else self.sound
 
     def source(self) -> SpeechSource:
         """Where the speech comes from."""

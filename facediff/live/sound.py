@@ -104,6 +104,6 @@ class SoundOut(Receiver):
             self._place = due
         at = self._place + np.arange(count)
         with self._lock:
-            there = (at >= max(0, self._end - len(self._kept))) & (at < self._end)
-            out[there, 0] = self._kept[at[there] % len(self._kept)]
+            available = (at >= max(0, self._end - len(self._kept))) & (at < self._end)
+            out[available, 0] = self._kept[at[available] % len(self._kept)]
         self._place += count

@@ -31,7 +31,7 @@ PIECE = 0.01
 """Seconds of a recording that are played at a time."""
 
 AHEAD = 0.25
-"""Seconds by which samples of a pipe may be ahead of the clock: what a recorder has kept while this program started."""
+"""Seconds by which samples of a pipe may be ahead of the clock: a recorder's buffer at the start of this program."""
 
 FASTER = 1.005
 """Samples of a pipe are taken at most so much faster than they are played: more than the clocks of sound cards differ,
@@ -92,22 +92,20 @@ class Pcm(SpeechSource):
     name = "standard input"
 
     def __init__(self, rate: int = SAMPLE_RATE) -> None:
-        if sys.stdin is None or sys.stdin.closed:
-            raise FaceDiffError("standard input: is closed; send 16-bit mono samples to it")
+        if sys.stdin is None or sys.stdin.closed or sys.stdin.isatty():
+            raise FaceDiffError("standard input: is closed or a terminal; send 16-bit mono samples, as from arecord")
         self._stream = sys.stdin.buffer
-        if sys.stdin.isatty():
-            raise FaceDiffError("standard input: is a terminal; send 16-bit mono samples to it, as from arecord")
         self.rate = rate
         self._convert = Resampler(rate, SAMPLE_RATE)
 
     def run(self, deliver: Deliver, stopped: threading.Event) -> None:
-        """Hand over what is there, no faster than it is spoken."""
+        """Hand over the samples, no faster than they are spoken."""
         read, start = 0, 0.0
         for samples in pcm(self._stream, self.rate):
-            now = time.monotonic()
-            start = start or now
+            timestamp = time.monotonic()
+            start = start or timestamp
             read += len(samples)
-            early = start + read / self.rate / FASTER - AHEAD - now
+            early = start + read / self.rate / FASTER - AHEAD - timestamp
             if stopped.wait(max(0.0, early)):
                 return
             deliver(self._convert(samples), time.monotonic() - self._convert.delay)
@@ -140,12 +138,12 @@ class Microphone(SpeechSource):
         convert, latest, broken = Resampler(self.rate, SAMPLE_RATE), [time.monotonic()], list[Exception]()
 
         def heard(block: npt.NDArray[np.float32], count: int, clock: Any, status: Any) -> None:  # noqa: ANN401
-            now = time.monotonic()
-            latest[0] = now
+            timestamp = time.monotonic()
+            latest[0] = timestamp
             self.lost += bool(status)
             # The block was recorded before it is handed over; a driver that does not know when says 0.
             waited = clock.currentTime - clock.inputBufferAdcTime - count / self.rate
-            arrived = now - waited if clock.inputBufferAdcTime and 0 < waited < 1 else now
+            arrived = timestamp - waited if clock.inputBufferAdcTime and 0 < waited < 1 else timestamp
             try:
                 deliver(convert(block[:, 0].copy()), arrived - convert.delay)
             except Exception as error:  # noqa: BLE001 - raised in the thread that waits; PortAudio would only print it
@@ -196,22 +194,24 @@ def find_device(library: Any, device: str, kind: str) -> tuple[int, dict[str, An
         devices = list(library.query_devices())
     except (library.PortAudioError, OSError) as error:
         raise FaceDiffError(f"{word}: no sound device can be asked for ({error}); give a recording") from error
-    fit = {place: facts for place, facts in enumerate(devices) if facts[f"max_{kind}_channels"] > 0}
+    fit = {number: facts for number, facts in enumerate(devices) if facts[f"max_{kind}_channels"] > 0}
     if not fit:
         raise FaceDiffError(
             f"{word}: there is no {kind} device; connect one"
             + (", or give a recording, or samples on standard input" if kind == "input" else ", or leave it out")
         )
     if device == USUAL:
-        usual = library.default.device[0 if kind == "input" else 1]
-        place = usual if usual in fit else next(iter(fit))
-        return place, fit[place]
-    named = [place for place, facts in fit.items() if device == str(place) or device.lower() in facts["name"].lower()]
-    exact = [place for place in named if device in (str(place), fit[place]["name"])]
-    if len(named) == 1 or exact:
-        return (exact or named)[0], fit[(exact or named)[0]]
-    names = [f"{place}: {facts['name']}" for place, facts in fit.items()]
-    problem = "several devices are called so" if named else f"there is no {kind} device of this name or number"
+        default = library.default.device[0 if kind == "input" else 1]
+        number = default if default in fit else next(iter(fit))
+        return number, fit[number]
+    matches = [
+        number for number, facts in fit.items() if device == str(number) or device.lower() in facts["name"].lower()
+    ]
+    exact = [number for number in matches if device in (str(number), fit[number]["name"])]
+    if len(matches) == 1 or exact:
+        return (exact or matches)[0], fit[(exact or matches)[0]]
+    names = [f"{number}: {facts['name']}" for number, facts in fit.items()]
+    problem = "several devices are called so" if matches else f"there is no {kind} device of this name or number"
     raise FaceDiffError(f"{word} {device}: {problem}; {choices(device, names)}")
 
 

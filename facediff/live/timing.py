@@ -36,7 +36,7 @@ class SpokenClock:
     without any such delay: by the earliest arrival of the last seconds, so that clocks of sound cards may drift.
 
     Attributes:
-        offset: what is added to the latest moments; read by other threads.
+        offset: added to the latest moments; read by other threads.
     """
 
     def __init__(self) -> None:
@@ -89,14 +89,14 @@ class Pacer:
     def __init__(self, hop: float) -> None:
         self.hop = hop
         self.delay: float | None = None
-        self._needed: deque[tuple[float, float]] = deque()  # (when, what a burst needed)
+        self._needed: deque[tuple[float, float]] = deque()  # (time, seconds that a burst needed)
         self._changed = 0.0
 
-    def ready(self, spoken: float, now: float) -> None:
-        """The first frame of a burst has become ready, whose speech was spoken at a time."""
-        needed = now - spoken
-        self._needed.append((now, needed))
-        while self._needed[0][0] < now - MEMORY:
+    def ready(self, speech_time: float, timestamp: float) -> None:
+        """The first frame of a burst has become ready; its speech was spoken at a time."""
+        needed = timestamp - speech_time
+        self._needed.append((timestamp, needed))
+        while self._needed[0][0] < timestamp - MEMORY:
             self._needed.popleft()
         all_needed = [need for _, need in self._needed]
         if self.delay is None:
@@ -106,12 +106,12 @@ class Pacer:
         else:
             enough = min(self.delay, max(all_needed) + MARGIN)
             rate = min(FASTEST, SHRINKING + HURRY * max(0.0, self.delay - enough - GROWTH))
-            self.delay = max(enough, self.delay - rate * min(MEMORY, now - self._changed))
-        self._changed = now
+            self.delay = max(enough, self.delay - rate * min(MEMORY, timestamp - self._changed))
+        self._changed = timestamp
 
-    def due(self, spoken: float) -> float:
-        """When a frame is due whose speech was spoken at a time."""
-        return spoken + (self.delay or 0.0)
+    def due(self, speech_time: float) -> float:
+        """When the frame of a moment of speech is due."""
+        return speech_time + (self.delay or 0.0)
 
 
 class Thinning:
@@ -140,13 +140,13 @@ class Thinning:
 
     def waiting(self, *, behind: bool) -> None:
         """Take note of whether more speech waits than usual."""
-        now = monotonic()
+        timestamp = monotonic()
         if behind:
-            self._behind = now
-            if self.stride < self._most and now > self._changed + self.SETTLING:
-                self.stride, self._changed = min(2 * self.stride, self._most), now
-        elif self.stride > 1 and now > max(self._changed, self._behind) + self.CALM:
-            self.stride, self._changed = self.stride // 2, now
+            self._behind = timestamp
+            if self.stride < self._most and timestamp > self._changed + self.SETTLING:
+                self.stride, self._changed = min(2 * self.stride, self._most), timestamp
+        elif self.stride > 1 and timestamp > max(self._changed, self._behind) + self.CALM:
+            self.stride, self._changed = self.stride // 2, timestamp
 
     def sends(self, index: int) -> bool:
         """Whether the frame of a number is sent."""

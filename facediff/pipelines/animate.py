@@ -1,6 +1,6 @@
 """Recordings of speech animated with one model, one face and one style: all that is not the model's own.
 
-From top to bottom: what is refused before a model is loaded (:func:`check_options`); and :class:`AnimationPipeline`,
+From top to bottom: the checks before a model is loaded (:func:`check_options`); and :class:`AnimationPipeline`,
 which takes speech from samples to finished animations and files. Subclasses generate the motion: with PyTorch
 (:mod:`facediff.pipelines.trained`) or without (:mod:`facediff.pipelines.exported`).
 """
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 PIXEL_SECONDS = 4e-8  # What drawing and encoding a pixel of a video takes
 
 Progress = Callable[[int, int], object]
-"""Called with what is done and the total, in denoising steps or seconds of speech."""
+"""Called with the progress and the total, in denoising steps or seconds of speech."""
 
 
 def check_directed(options: AnimationOptions) -> None:
@@ -82,12 +82,11 @@ def check_options(options: AnimationOptions) -> None:
             raise OptionError(
                 name, "is for a folder of Audio2Face-3D, other models have their own; omit it", getattr(options, name)
             )
-    if options.mesh is not None and not Path(options.mesh).is_file():
-        raise OptionError("mesh", "no such file", options.mesh)
+    for name in ("mesh", "target_mesh"):
+        if (file := getattr(options, name)) is not None and not Path(file).is_file():
+            raise OptionError(name, "no such file", file)
     if options.style_template is not None and options.style is None:
         raise OptionError("style_template", "belongs to a motion; give {style} as well")
-    if options.target_mesh is not None and not Path(options.target_mesh).is_file():
-        raise OptionError("target_mesh", "no such file", options.target_mesh)
     if options.own_shapes:
         from facediff.export.glb_own_shapes import own_shapes
 
@@ -126,7 +125,7 @@ class AnimationPipeline(ABC):
     """
 
     style_name = ""
-    """Name of the style of what was generated last."""
+    """Name of the style of the latest motion."""
     channels: Stage | None = None
     step_seconds = 0.01
     """What generating a second of speech takes on two processor cores."""
@@ -146,13 +145,15 @@ class AnimationPipeline(ABC):
         self.options, self.facts, self.windows = options, face, windows
         self.frame_rate: float = face["frame_rate"]
         self.windows.in_frames(self.frame_rate)
-        one_animation = f"{model} makes one animation, whatever the seed; omit the option"
+        one_animation = f"{model} makes one animation for all seeds; omit the option"
         if options.samples > 1 and not samples:
             raise OptionError("samples", one_animation, options.samples)
-        drawn = is_procedural(options) and options.controls_seed is None
-        if options.seed and not samples and not drawn:
+        draws_controls = is_procedural(options) and options.controls_seed is None
+        if options.seed and not samples and not draws_controls:
             raise OptionError("seed", one_animation, options.seed)
-        self.seed = options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or drawn else 0
+        self.seed = (
+            options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or draws_controls else 0
+        )
         self.progress: Progress | None = None
         self.decoder = decoder
         self.gate = options.voice_gate or usual_gate
@@ -179,7 +180,7 @@ class AnimationPipeline(ABC):
 
     @property
     def stages(self) -> list[Stage]:
-        """What a recording goes through, in this order."""
+        """The stages of a recording, in their order."""
         options = self.options
         stages: list[Stage | None] = [
             Denoise(noise=options.denoise, semitones=options.voice_shift),
@@ -196,7 +197,7 @@ class AnimationPipeline(ABC):
 
     @abstractmethod
     def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
-        """Frames for some speech (S,), and their absolute points part by part: those of each sample, (T, V, dims)."""
+        """Frames for some speech (S,), and their absolute points part by part, for each sample (T, V, dims)."""
 
     @abstractmethod
     def generator(self, seed: int) -> VertexGenerator:
@@ -234,20 +235,20 @@ class AnimationPipeline(ABC):
     @property
     @abstractmethod
     def corpus(self) -> str:
-        """What errors call the model's faces."""
+        """Name of the model's faces in errors."""
 
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on."""
         self.direction = direction
         self.face = None
-        finished = None if direction is None else direction.without_model_channels()
-        if finished is not None or not self.options.without_keys.is_off:
+        face_direction = None if direction is None else direction.without_model_channels()
+        if face_direction is not None or not self.options.without_keys.is_off:
             from facediff.editing.controlled import ControlledFace
 
             face = self.facts
             self.face = ControlledFace(
                 self.options.controls,
-                finished,
+                face_direction,
                 face["template"],
                 face["faces"],
                 face["regions"],
@@ -281,7 +282,7 @@ class AnimationPipeline(ABC):
         from facediff.export import write_animations
         from facediff.mesh.textures import hands_on_textures
 
-        # What a surface alone lacks would be lost: materials, skins and targets of a .glb, coordinates and pictures.
+        # A surface alone would lose materials, skins and targets of a .glb, coordinates and pictures.
         target = Path(self.options.target_mesh or "")
         is_dressed = holds_glb(output) and export.output_unit is None and self._target_has_materials
         into = target if is_dressed or hands_on_textures(target, output) else None
@@ -306,16 +307,16 @@ class AnimationPipeline(ABC):
     ) -> Iterator[list[Animation]]:
         """Finished samples of a recording; long ones are on disk as long as the context lasts.
 
-        The arguments are those of :meth:`write`; the folder of ``output`` must have room for long samples, which are
+        The arguments are as in :meth:`write`; the folder of ``output`` must have room for long samples, which are
         kept in memory if it is None.
         """
         first = self.seed if seed is None else seed
         count, name = self.options.samples, valid_text(recording.name)
         # Counted in whole frames, as the model counts them: otherwise speech of just about the limit would be animated
         # by windows here and in one pass there.
-        short = self.windows.in_one_pass(self.frames_of(len(recording.speech)), self.frame_rate)
+        fits_memory = self.windows.in_one_pass(self.frames_of(len(recording.speech)), self.frame_rate)
         spool: AbstractContextManager[Path | None] = (
-            nullcontext() if short or output is None else scratch_folder(output)
+            nullcontext() if fits_memory or output is None else scratch_folder(output)
         )
         with spool as folder:
             samples = [
@@ -351,15 +352,15 @@ class AnimationPipeline(ABC):
         return max(self.stream_timing[0], *(stage.look_ahead for stage in self.stages))
 
     def track(self, items: Iterable[int], description: str) -> Iterable[int]:
-        """Items one by one, whose progress is shown or reported."""
+        """Items one by one, with their progress shown or reported."""
         report = self.progress
         if report is None:
             yield from items if self.options.quiet else track(items, description)
             return
         total = len(items) if isinstance(items, Sequence) else 0
-        for done, item in enumerate(items, start=1):
+        for count, item in enumerate(items, start=1):
             yield item
-            report(done, max(done, total))
+            report(count, max(count, total))
 
     def still(self, sample: Sample | None) -> Animation:
         """The face at rest, one frame: of a sample, with everything that its animation says; or of a stream."""

@@ -61,7 +61,7 @@ def load(
             the Hugging Face hub, or a folder of ``facediff export-model`` or of Audio2Face-3D, which need no PyTorch;
             ``puppet`` or None for the model that comes with facediff.
         device: where it computes: cpu, cuda …; ``auto`` for a CUDA device where there is one.
-        commercial_only: refuse a model whose licence labels do not allow commercial use.
+        commercial_only: refuse a model unless its licence labels allow commercial use.
         dtype: in which it multiplies, float32 or bfloat16.
 
     Raises:
@@ -75,24 +75,24 @@ def load(
     """
     if source is not None and not isinstance(source, str | Path):
         raise FaceDiffError(f"source: is of the type {type(source).__name__}; {EXPECTED_TO_ANIMATE}")
-    named: str | Path = model_or_bundled(source)
-    if is_exported(named):
+    path: str | Path = model_or_bundled(source)
+    if is_exported(path):
         options = AnimationOptions(
-            checkpoint=named, device=device, commercial_only=commercial_only, precision=precision_of(dtype)
+            checkpoint=path, device=device, commercial_only=commercial_only, precision=precision_of(dtype)
         )
-        if is_audio2face(named):
+        if is_audio2face(path):
             from facediff.pipelines.audio2face import Audio2FacePipeline
 
-            return Audio2FaceAnimator(Audio2FacePipeline(options).model, named)
+            return Audio2FaceAnimator(Audio2FacePipeline(options).model, path)
         from facediff.pipelines.exported import ExportedPipeline
 
-        return Animator(ExportedPipeline(options).model, named)
-    check_animating_source(named)  # before torch is imported
+        return Animator(ExportedPipeline(options).model, path)
+    check_animating_source(path)  # before torch is imported
     from facediff.models import load_model
     from facediff.pipelines.trained import usable_device
 
-    module = load_model(named, usable_device(device), commercial_only=commercial_only)
-    return Animator(module, named, dtype=dtype)
+    module = load_model(path, usable_device(device), commercial_only=commercial_only)
+    return Animator(module, path, dtype=dtype)
 
 
 def import_checkpoint(
@@ -129,7 +129,7 @@ class Backend(ABC):
 
     Attributes:
         identities: those that it was trained on; the first one is the default.
-        other_identities: further ones whose face it knows.
+        other_identities: further ones with a known face.
         frame_rate: frames a second of its animations.
         unit: unit of length of its animations.
         n_vertices: vertices of its faces.
@@ -273,7 +273,7 @@ class Animator:
         *,
         dtype: DType = "float32",
     ) -> None:
-        precision_of(dtype)  # refuses what is none
+        precision_of(dtype)  # refuses other types
         self.model: Any = model
         self.backend = backend_of(model)
         self.source = type(model).__name__ if source is None else source
@@ -291,12 +291,12 @@ class Animator:
 
     @property
     def other_identities(self) -> list[str]:
-        """Further identities whose face it knows, and whose motion it was not trained on."""
+        """Further identities with a known face, without motion in the training data."""
         return self.backend.other_identities
 
     @property
     def frame_rate(self) -> float:
-        """Frames a second of its animations; that of Audio2Face-3D may be set."""
+        """Frames a second of its animations; of Audio2Face-3D it may be set."""
         return self.backend.frame_rate
 
     @frame_rate.setter
@@ -413,10 +413,10 @@ class Animator:
                 theirs; a pair of samples and their rate, as soundfile, librosa and torchaudio read them; the audio of a
                 Hugging Face data set, ``{"array", "sampling_rate"}`` or ``{"bytes", "path"}``; or several recordings:
                 a list of any of these, or a folder.
-            rate: sample rate of an array; that of a tensor is 16 kHz if None.
+            rate: sample rate of an array; of a tensor 16 kHz if None.
             name: the animation's name; the recording's if None.
-            progress: whether there is a progress bar; or a function that is called with what is done and the total.
-            dtype: in which the model multiplies, ``float32`` or ``bfloat16``, or PyTorch's of that name; that of the
+            progress: whether there is a progress bar; or a function that is called with the progress and the total.
+            dtype: in which the model multiplies, ``float32`` or ``bfloat16``, or PyTorch's of that name; as the
                 model if None. The same as ``precision`` 32 or bf16.
             options: listed below. With ``seed=None``, the seed is drawn at random; the metadata names it.
 
@@ -425,33 +425,33 @@ class Animator:
             list with what each of them alone would give.
 
         Raises:
-            FaceDiffError: naming what is wrong with the speech or an option.
+            FaceDiffError: naming the fault of the speech or of an option.
         """
-        chosen = self._options(dtype, quiet=progress is not True, **options)
-        several = recordings_of(speech)
-        if several is not None:
+        settings = self._options(dtype, quiet=progress is not True, **options)
+        recordings = recordings_of(speech)
+        if recordings is not None:
             for option in ("alignment", "transcript"):
-                if getattr(chosen, option) is not None:
+                if getattr(settings, option) is not None:
                     raise OptionError(option, "is for one recording; omit it, or animate them one by one")
             if name is not None:
                 raise FaceDiffError("name: is for one recording; omit it, each has its own")
         from facediff.speech.audio import speech_of
 
         animations: list[Animation | Samples] = []
-        with self.backend.open(chosen) as pipeline:
+        with self.backend.open(settings) as pipeline:
             pipeline.progress = None if isinstance(progress, bool) else progress
-            for recording in [speech] if several is None else several:
+            for recording in [speech] if recordings is None else recordings:
                 if not isinstance(recording, str | Path):
-                    refuse_folder(chosen.direction)
-                elif chosen.direction is not None:
-                    direction = direction_for(chosen.direction, Path(recording))
-                    if direction is not chosen.direction:
-                        check_directed(replace(chosen, direction=direction))
+                    refuse_folder(settings.direction)
+                elif settings.direction is not None:
+                    direction = direction_for(settings.direction, Path(recording))
+                    if direction is not settings.direction:
+                        check_directed(replace(settings, direction=direction))
                         pipeline.direct(keys_of(direction, pipeline.frame_rate))
-                spoken = speech_of(recording, rate, chosen.max_seconds)
-                with pipeline.animations(replace(spoken, name=name or spoken.name)) as finished:
-                    animations.append(finished[0] if chosen.samples == 1 else Samples(finished))
-        return animations[0] if several is None else animations
+                recording_speech = speech_of(recording, rate, settings.max_seconds)
+                with pipeline.animations(replace(recording_speech, name=name or recording_speech.name)) as samples:
+                    animations.append(samples[0] if settings.samples == 1 else Samples(samples))
+        return animations[0] if recordings is None else animations
 
     @with_options(AnimationOptions, StreamKeywords)
     def stream(
@@ -464,7 +464,7 @@ class Animator:
     ) -> Iterator[npt.NDArray[np.float32]]:
         """Animate speech of any length while it arrives, as ``facediff animate --stream`` does.
 
-        The frames are those of the recording as a whole by windows, however the speech is cut into chunks.
+        The frames equal the windows of the whole recording, however the speech is cut into chunks.
 
         Args:
             chunks: pieces of mono speech: arrays or tensors (n,), or bytes of 16-bit samples (little endian).
@@ -476,7 +476,7 @@ class Animator:
             absolute vertices (m, V, 3) of the next frames, as soon as these are certain.
 
         Raises:
-            FaceDiffError: naming what is wrong with an option or a chunk.
+            FaceDiffError: naming the fault of an option or of a chunk.
 
         Example:
             >>> for frames in model.stream(microphone(), identity="F1"):  # doctest: +SKIP
@@ -485,9 +485,9 @@ class Animator:
         from facediff.speech.audio import stream_piece
 
         rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
-        chosen = self._options(dtype, **options)
-        refuse_folder(chosen.direction)
-        with self.backend.open(chosen) as pipeline:
+        settings = self._options(dtype, **options)
+        refuse_folder(settings.direction)
+        with self.backend.open(settings) as pipeline:
             stream = pipeline.stream(rate)
 
         def frames() -> Iterator[npt.NDArray[np.float32]]:
@@ -507,9 +507,9 @@ class Animator:
         precision = precision_of(self.dtype if dtype is None else dtype)
         if dtype is not None and options.get("precision", precision) != precision:
             raise OptionError("precision", f"contradicts dtype {dtype}; give one of them", options["precision"])
-        chosen = AnimationOptions(checkpoint=self.source, **{"precision": precision, **options})
-        check_options(chosen)
-        return chosen
+        settings = AnimationOptions(checkpoint=self.source, **{"precision": precision, **options})
+        check_options(settings)
+        return settings
 
     def extract_style(
         self, clips: StyleLike | Sequence[str | Path | Animation], *, identity: str | None = None
@@ -518,13 +518,13 @@ class Animator:
 
         Args:
             clips: motion of one speaker: names of clips or styles, files, animations or arrays; one, or a list of them.
-            identity: whose motion it is, where nothing else says it; the first one trained on if None.
+            identity: the speaker, unless the clips name it; the first one trained on if None.
 
         Raises:
             FaceDiffError: if a clip cannot be read, is a style vector already, or the model has no style.
         """
-        given: list[StyleLike] = list(clips) if isinstance(clips, list | tuple) else [cast("StyleLike", clips)]
-        vector = self.backend.extract_style(given, identity or self.identities[0])
+        references: list[StyleLike] = list(clips) if isinstance(clips, list | tuple) else [cast("StyleLike", clips)]
+        vector = self.backend.extract_style(references, identity or self.identities[0])
         if not len(vector):
             raise FaceDiffError(f"{self.source}: was trained without a dynamic style, so it has no style vectors")
         return vector
@@ -542,7 +542,7 @@ class Animator:
         Args:
             folder: a folder that does not exist, or is empty.
             half: store the parameters in 16 bits; the motion differs a little.
-            license: licence of the weights, such as ``apache-2.0``; that of the data if None.
+            license: licence of the weights, such as ``apache-2.0``; as the data if None.
             card: ``name``, ``scores`` (test_scores.csv of ``facediff test``) and ``languages`` for the model card.
 
         Raises:
@@ -551,10 +551,10 @@ class Animator:
         return self.module.save_pretrained(folder, half=half, license=license, **card)
 
     def __repr__(self) -> str:
-        known = f"identities {', '.join(self.identities)}"
-        known += f" (not trained on: {', '.join(self.other_identities)})" if self.other_identities else ""
+        identities = f"identities {', '.join(self.identities)}"
+        identities += f" (not trained on: {', '.join(self.other_identities)})" if self.other_identities else ""
         return (
-            f"Animator({str(self.source)!r}: {type(self.model).__name__} of {self.corpus}, {known}, "
+            f"Animator({str(self.source)!r}: {type(self.model).__name__} of {self.corpus}, {identities}, "
             f"{self.frame_rate:g} frames a second, {self.n_vertices} vertices in {self.unit}, on {self.device}; "
             f"{self.licence})"
         )
@@ -595,9 +595,9 @@ class Audio2FaceAnimator(Animator):
         """Weights (T, K) of the folder's blendshapes for vertices.
 
         Args:
-            part: whose shapes: ``skin`` or ``tongue``.
+            part: of the face: ``skin`` or ``tongue``.
             vertices: absolute positions (T, V, 3) of all of its vertices.
-            temporal: strength of the temporal term; that of :attr:`weights` if None.
+            temporal: strength of the temporal term; as :attr:`weights` if None.
 
         Raises:
             FaceDiffError: if the folder has no such shapes, or the vertices are others.
@@ -619,7 +619,7 @@ def precision_of(dtype: DType) -> Literal["32", "bf16"]:
     return PRECISIONS[name]
 
 
-def recordings_of(speech: Any) -> list[Any] | None:  # noqa: ANN401 - whatever speech may be
+def recordings_of(speech: Any) -> list[Any] | None:  # noqa: ANN401 - speech in any form
     """Several recordings, from a list or a folder; None for one recording.
 
     Raises:

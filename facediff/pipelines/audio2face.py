@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from facediff.editing.direction import Direction
 
 FRAME_RATE = 30.0
-"""Frames a second where nobody chooses; any rate will do."""
+"""Frames a second by default; any rate will do."""
 
 UNIT = "cm"
 
 Part = Literal["skin", "tongue"]
 
 Solver = Literal["nvidia", "facediff"]
-"""Whose solver makes weights of vertices: NVIDIA's regularised system, or facediff's bounded least squares."""
+"""Solver of the weights: NVIDIA's regularised system, or facediff's bounded least squares."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class Audio2FaceWeights:
     """How weights of a folder's blendshapes are solved for.
 
     Attributes:
-        solver: whose solver makes weights: ``nvidia`` or ``facediff``.
+        solver: of the weights: ``nvidia`` or ``facediff``.
         temporal_term: of NVIDIA's solver: ``published`` shrinks motion where its strength is not 0, ``corrected`` does
             what it is for.
-        temporal: strength of that term; that of the folder if None.
+        temporal: strength of that term; as in the folder if None.
     """
 
     solver: Solver = "nvidia"
@@ -61,7 +61,7 @@ class Audio2FaceWeights:
 
         Args:
             model: the model.
-            part: whose shapes.
+            part: of the face.
             vertices: absolute positions (T, V, 3) of all of its vertices.
         """
         poses = model.folder.poses.get(part)
@@ -143,7 +143,7 @@ class Audio2FacePipeline(AnimationPipeline):
                 raise OptionError(name, f"the folder has one face, {self.actor}; omit it", getattr(options, name))
         text = _style_text(options)
         self.emotion = {} if text is None else emotions_of(text)
-        self.model.emotion(self.emotion)  # refuses what the model does not know
+        self.model.emotion(self.emotion)  # refuses unknown emotions
         self._animated: list[dict[str, Array]] = []
         template = folder.arrays["skin"]
         super().__init__(
@@ -165,7 +165,7 @@ class Audio2FacePipeline(AnimationPipeline):
 
     @property
     def stream_timing(self) -> tuple[float, float]:
-        """What a window has after its frame's moment, and a frame: each has a window of its own."""
+        """Seconds of a window after the moment of its frame, and of a frame: each has a window of its own."""
         facts = self.model.folder.facts
         return (facts.buffer - facts.before) / SAMPLE_RATE, 1 / self.frame_rate
 
@@ -177,7 +177,7 @@ class Audio2FacePipeline(AnimationPipeline):
 
     @property
     def corpus(self) -> str:
-        """What errors call the model's face."""
+        """Name of the model's face in errors."""
         return f"Audio2Face-3D's {self.actor}"
 
     def frames_of(self, samples: int) -> int:
@@ -227,7 +227,7 @@ class Audio2FacePipeline(AnimationPipeline):
     def space(self) -> Space:
         """The channels: the folder's shapes, then the jaw's turn and shift and the eyes' turns, in radians and cm.
 
-        Its ``mouthClose`` is that of a closed mouth with an open jaw, and not Apple's, which is added to ``jawOpen``.
+        Its ``mouthClose`` closes the mouth over an open jaw, and not Apple's, which is added to ``jawOpen``.
         """
         poses = self.model.folder.poses
         skin = poses["skin"].names
@@ -258,12 +258,12 @@ class Audio2FacePipeline(AnimationPipeline):
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
         facts = self.model.folder.facts
-        chosen = ",".join(f"{name}:{strength:g}" for name, strength in self.emotion.items())
+        emotions = ",".join(f"{name}:{strength:g}" for name, strength in self.emotion.items())
         return {
             "model": f"Audio2Face-3D v2.3, {facts.actor}",
             **licence_metadata(licences_of(self.model)),
             "identity": self.actor,
-            "style": chosen or "the usual emotion",
+            "style": emotions or "the usual emotion",
         }
 
 
@@ -299,8 +299,8 @@ class Audio2FaceStream:
         """The frames (m, V, 3) that more speech (n,) at 16 kHz makes certain."""
         self._speech = np.concatenate([self._speech, np.asarray(samples, np.float32)])
         facts = self.model.folder.facts
-        heard = self._dropped + len(self._speech)
-        return self._next(self.model.frames(max(0, heard - (facts.buffer - facts.before) + 1), self.frame_rate))
+        sample_count = self._dropped + len(self._speech)
+        return self._next(self.model.frames(max(0, sample_count - (facts.buffer - facts.before) + 1), self.frame_rate))
 
     def finish(self) -> Array:
         """The frames (m, V, 3) that are left."""

@@ -1,4 +1,4 @@
-"""Models of every kind on one face: what each makes of the same speech, and what it costs.
+"""Models of every kind on one face: their motion for the same speech, and its cost.
 
 A candidate is anything that :func:`facediff.load` opens, or a folder of motion that a model made elsewhere. Vertices of
 the built-in topology and weights of ARKit's shapes are put on the face as they are; other meshes, FLAME's among them,
@@ -42,7 +42,7 @@ MOTION_SUFFIXES = (".csv", ".json", ".npz", ".npy")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model, or what one made elsewhere.
+    """A model, or motion from elsewhere.
 
     Attributes:
         name: that tables show.
@@ -50,7 +50,7 @@ class Candidate:
         motion: folder of files that are called as the clips are; None for a model.
         layout: of parameters in these files that do not say it; see :func:`facediff.spaces.layouts.layout`.
         frame_rate: frames a second of these files, where they do not say it.
-        identity: whose face is animated; the speaker of the open face where the model has it, if None.
+        identity: the animated face; the speaker of the open face where the model has it, if None.
         style: as ``facediff animate`` takes it.
         licence: of a model that ran elsewhere.
         commercial_use: allowed, forbidden or unknown; of such a model.
@@ -69,7 +69,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class CandidateMotion:
-    """What a candidate made of all clips.
+    """A candidate's motion for all clips.
 
     Attributes:
         candidate: the candidate.
@@ -134,8 +134,8 @@ class Placement:
                 f"its motion is {len(space.channels)} channels of {space.kind} that no face is known for"
             )
         self.jaw = space.face.index(jaw.start)
-        missing = "no FLAME model was given (--flame)" if space.kind == "flame" else "nothing says what they move"
-        self.way = f"channels alone, since {missing}: the mouth's opening is the jaw's turn, and lips are not seen"
+        reason = "no FLAME model was given (--flame)" if space.kind == "flame" else "nothing says what they move"
+        self.way = f"channels alone, since {reason}: the mouth's opening is the jaw's turn, and lips are not seen"
         return SpokenMotion(values[:, list(space.face), None].astype(np.float64), head)
 
     def animation(self, animation: Animation) -> SpokenMotion:
@@ -161,7 +161,7 @@ class Placement:
         except FaceDiffError:
             if kind != "flame" or animation.values is None:
                 raise
-            # A mesh that is no face, such as that of a checkpoint without FLAME's: its channels are still something.
+            # A mesh that is no face, as in a checkpoint without FLAME's: its channels are still something.
             return self.values(animation.values, animation.space)
         self.way = f"{len(still.template)} vertices, carried over"
         return SpokenMotion(carried, head)
@@ -170,9 +170,9 @@ class Placement:
         """Weights of ARKit's shapes on the face; those that a space lacks are 0."""
         column = {name.casefold(): index for index, name in enumerate(space.channels)}
         weights = np.zeros((len(values), len(ARKIT)))
-        for place, name in enumerate(ARKIT):
+        for channel, name in enumerate(ARKIT):
             if name.casefold() in column:
-                weights[:, place] = values[:, column[name.casefold()]]
+                weights[:, channel] = values[:, column[name.casefold()]]
         if space.version == "audio2face":
             # Audio2Face's mouthClose is a mouth that is closed over an open jaw; Apple's is added to an open jaw.
             weights[:, ARKIT.index("jawOpen")] += weights[:, ARKIT.index("mouthClose")]
@@ -194,7 +194,7 @@ class Placement:
 
 
 def space_at_rest(space: Space) -> Array:
-    """Values (C,) of a space whose rotations do not turn; all 0 but those of a six-number rotation or a quaternion."""
+    """Values (C,) of a space at rest; all 0 but for rotations of six numbers and quaternions."""
     rest = np.zeros(len(space.channels))
     for turn in space.rotations:
         rest[list(turn.channels)] = convert(np.zeros((1, 3)), "axis_angle", turn.form)[0]
@@ -202,9 +202,9 @@ def space_at_rest(space: Space) -> Array:
 
 
 def perform(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None) -> CandidateMotion | str:
-    """What a candidate makes of the clips, or in words why it makes nothing.
+    """A candidate's motion for the clips, or the reason why there is none.
 
-    Meant for a process of its own, whose memory is then the candidate's.
+    Meant for a process of its own, so that its memory is the candidate's.
     """
     try:
         placement = Placement(open_face(), None if flame is None else Flame.read(flame))
@@ -216,8 +216,6 @@ def perform(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | Non
 def _animate(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placement) -> CandidateMotion:
     from facediff.pipelines.animator import load
 
-    if candidate.model is None:
-        raise FaceDiffError(f"{candidate.name}: names no model")
     animator = load(candidate.model, device="cpu")
     faces = [*animator.identities, *animator.other_identities]
     identity = candidate.identity or (SPEAKER if SPEAKER in faces else None)
@@ -225,13 +223,13 @@ def _animate(candidate: Candidate, clips: Sequence[SpokenClip], placement: Place
     if candidate.style is not None:
         options["style"] = candidate.style
     motions: dict[str, SpokenMotion] = {}
-    # The first call loads what is loaded late, so it is not counted.
+    # The first call loads libraries, so it is not counted.
     animator.animate(clips[0].samples, SAMPLE_RATE, name="first", **options)
-    taken = 0.0
+    processor_seconds = 0.0
     for clip in clips:
         started = time.process_time()
         animation = animator.animate(clip.samples, SAMPLE_RATE, name=clip.name, **options)
-        taken += time.process_time() - started
+        processor_seconds += time.process_time() - started
         motions[clip.name] = placement.animation(animation)
     metadata = animation.metadata
     return CandidateMotion(
@@ -242,7 +240,7 @@ def _animate(candidate: Candidate, clips: Sequence[SpokenClip], placement: Place
         placement.way,
         metadata.get("licence", "unknown"),
         metadata.get("commercial_use", "unknown"),
-        taken / sum(clip.seconds for clip in clips),
+        processor_seconds / sum(clip.seconds for clip in clips),
         peak_memory(),
     )
 
@@ -269,8 +267,8 @@ def _read(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placemen
             recorded = even(
                 read_parameters(file, layout=candidate.layout if arrays else None, frame_rate=candidate.frame_rate)
             )
-            own = recorded.space
-            space = replace(own, version="audio2face") if recorded.layout == "audio2face" else own
+            recorded_space = recorded.space
+            space = replace(recorded_space, version="audio2face") if recorded.layout == "audio2face" else recorded_space
             motions[clip.name], rate = placement.values(recorded.values, space), recorded.frame_rate
         if frame_rate is not None and abs(rate - frame_rate) > 1e-6 * rate:
             raise FaceDiffError(

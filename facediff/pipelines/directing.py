@@ -1,4 +1,4 @@
-"""Keys over time of what a model generates: style, condition, guidance and expressivity.
+"""Keys over time of a model's own options: style, condition, guidance and expressivity.
 
 A model generates with one style from beginning to end. Where keys change it, the same speech is generated once for each
 value with the same random numbers, and the motions are blended frame by frame by the keys' shares. That works for every
@@ -46,8 +46,8 @@ class ConditionedRun:
 
     Attributes:
         style: the style; the identity's own one if None.
-        condition: the training identity that conditions the model; that of the face if None.
-        choices: what the model is set to, as :meth:`facediff.models.inference.Inference.choices` gives it.
+        condition: the training identity that conditions the model; the face's if None.
+        choices: settings of the model, as :meth:`facediff.models.inference.Inference.choices` gives it.
         shares: what its share of a frame is the product of, see :class:`Share`.
     """
 
@@ -119,7 +119,7 @@ def plan_runs(
     Args:
         direction: keys over time.
         model: set to what holds where there are no keys.
-        identity: whose face is animated.
+        identity: the animated face.
         style: what holds without keys of style.
         condition: what holds without keys of condition.
         style_template: as ``--style-template`` takes it.
@@ -140,11 +140,11 @@ def plan_runs(
     last = max(key.time for key in direction.keys)
     times = np.arange(int(np.ceil(last * model.frame_rate)) + 2) / model.frame_rate
     runs: list[ConditionedRun] = []
-    for chosen in product(*alternatives):
+    for combination in product(*alternatives):
         # Shares of an alternative that is alone are 1 at all times; without them the motion stays as it is.
         shares = tuple(
             share
-            for values_of_channel, (_, _, share) in zip(alternatives, chosen, strict=True)
+            for values_of_channel, (_, _, share) in zip(alternatives, combination, strict=True)
             if len(values_of_channel) > 1
         )
         run = ConditionedRun(style, condition, {}, shares)
@@ -156,23 +156,23 @@ def plan_runs(
                 f"to be generated; use fewer different values"
             )
         with model.choosing():
-            now = {name: value for name, value, _ in chosen}
-            for name, value in now.items():
+            settings = {name: value for name, value, _ in combination}
+            for name, value in settings.items():
                 if name.startswith("guidance."):
                     scales = {name.partition(".")[2]: float(value)}
                     _named(direction, name, lambda scales=scales: model.choose_guidance(scales))
                 elif name == "expressivity":
                     _named(direction, name, lambda value=value: model.choose_expressivity(value))
-            run_condition = str(now["condition"]) if "condition" in now else condition
+            run_condition = str(settings["condition"]) if "condition" in settings else condition
             _named(direction, "condition", lambda run_condition=run_condition: model.check_condition(run_condition))
             runs.append(
-                ConditionedRun(styles.get(str(now.get("style")), style), run_condition, model.choices(), shares)
+                ConditionedRun(styles.get(str(settings.get("style")), style), run_condition, model.choices(), shares)
             )
     return runs
 
 
 def _named(direction: Direction, channel: str, step: Any) -> Any:  # noqa: ANN401
-    """What a step gives; its error says which channel of which file it comes from."""
+    """The result of a step; its error names the file and the channel."""
     try:
         return step()
     except FaceDiffError as error:
@@ -182,7 +182,7 @@ def _named(direction: Direction, channel: str, step: Any) -> Any:  # noqa: ANN40
 def _expressivity(
     direction: Direction, model: AnimationModel, identity: str
 ) -> list[tuple[str, float | str | Any, Share]]:
-    """The values of expressivity to generate with: that of the keys if it never changes, else the mean and a sample."""
+    """The values of expressivity to generate with: the keys' if it never changes, else the mean and a sample."""
     channels = direction.under("expressivity")
     if not channels:
         return []
@@ -196,8 +196,8 @@ def _expressivity(
         raise error.within(f"{direction.source}: channel expressivity") from error
     if None not in constants.values():
         factors = {name: float(value) for name, value in constants.items() if value is not None}
-        whole = {*factors} == {ALL}
-        value = factors[ALL] if whole else torch.from_numpy(weights.factors(factors)).float()
+        is_uniform = {*factors} == {ALL}
+        value = factors[ALL] if is_uniform else torch.from_numpy(weights.factors(factors)).float()
         if not model.samples and {*factors.values()} == {1.0}:
             value = 1.0
         return [("expressivity", value, Share(keys, 1.0))]
@@ -210,7 +210,7 @@ def blend(motions: Sequence[Tensor], runs: Sequence[ConditionedRun], frame_rate:
 
     Args:
         motions: one for each run.
-        runs: what they are.
+        runs: of these motions.
         frame_rate: frames a second.
         start: the number of the first frame.
     """
@@ -234,8 +234,8 @@ class DirectedStream:
 
     Args:
         model: the animating model.
-        runs: what is generated.
-        identity: whose face.
+        runs: to generate.
+        identity: the animated face.
         seeds: one for each sample.
         precision: makes a context within which the network computes; the style is encoded within it as well, as it is
             for a file.

@@ -48,7 +48,7 @@ ENDLESS = 1e9
 """Seconds that stand for no limit, since JSON knows no infinity."""
 
 LARGE = 1_000_000
-"""Numbers that are worth storing in fewer bits though nobody has learnt them, such as weights in another order."""
+"""Numbers that are worth storing in fewer bits though they are not learnt, such as weights in another order."""
 
 TOLERANCE = 1e-4
 """Largest difference from PyTorch in float32, as a share of the motion's range."""
@@ -66,7 +66,7 @@ def export_model(
     """Write a model as graphs for ONNX Runtime, with everything that animating needs.
 
     Weights may be stored in 16 or 8 bits; they are widened when the graph is loaded, and everything is computed in
-    float32. In ``int8`` those of the audio encoder take 8 bits a number, with a scale for each output channel, and all
+    float32. In ``int8`` the audio encoder's take 8 bits a number, with a scale for each output channel, and all
     others 16.
 
     Args:
@@ -74,7 +74,7 @@ def export_model(
         folder: to write; it must not exist.
         precision: how weights are stored.
         speech: (S,) at 16 kHz that the folder is compared with the model on; noise bursts if None.
-        identities: whose faces and styles the folder is to have; of all that the model knows if None.
+        identities: faces and styles of the folder; all that the model knows if None.
         styles: further styles by their names.
 
     Returns:
@@ -85,11 +85,11 @@ def export_model(
     require_onnx()
     _ = with_rig(model.assets).mesh  # refused before graphs are recorded, which takes a minute
     graphs = model.graphs()
-    known = list(model.assets.templates)
+    known_identities = list(model.assets.templates)
     for name in identities or ():
-        if name not in known:
-            raise OptionError("identities", f'there is no "{name}": {choices(name, known)}')
-    whose = known if identities is None else [name for name in known if name in set(identities)]
+        if name not in known_identities:
+            raise OptionError("identities", f'there is no "{name}": {choices(name, known_identities)}')
+    whose = known_identities if identities is None else [name for name in known_identities if name in set(identities)]
     with atomic_folder(folder) as staged:
         sizes, described = {}, {}
         for part in graphs.parts:
@@ -99,14 +99,14 @@ def export_model(
             path.write_bytes(document.SerializeToString())
             sizes[path.name] = path.stat().st_size
             described[part.name] = described_ends(document)
-        arrays, named = arrays_of(model, graphs, whose, styles or {})
+        arrays, style_names = arrays_of(model, graphs, whose, styles or {})
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
         (staged / ARRAYS).write_bytes(buffer.getvalue())
         sizes[ARRAYS] = len(buffer.getvalue())
-        description = describe(model, graphs, precision, sizes, described, named, whose)
+        description = describe(model, graphs, precision, sizes, described, style_names, whose)
         write_json(staged / DESCRIPTION, description.content())
-        read_folder(staged)  # what is written must be what is read
+        read_folder(staged)  # the folder must be readable
         checked = replace(
             description, check=compare(model, staged, trial_speech() if speech is None else speech, styles)
         )
@@ -146,7 +146,7 @@ def record(graph: Graph) -> onnx.ModelProto:
                 dynamic_shapes=shapes,
                 verbose=False,
             )
-    except Exception as error:  # whatever a component of anybody's does while it is recorded
+    except Exception as error:  # of any component while it is recorded
         raise FaceDiffError(
             f"{graph.name}: PyTorch cannot record this part of the model as a graph "
             f"({brief(error.__cause__ or error)}); choose components that do not depend on values, or report it"
@@ -155,14 +155,16 @@ def record(graph: Graph) -> onnx.ModelProto:
         raise FaceDiffError(f"{graph.name}: PyTorch gave no graph; install the PyTorch that facediff was tested with")
     document: onnx.ModelProto = program.model_proto
     names: dict[str, str] = {}
-    for each in document.graph.input:
-        for axis, name in graph.axes.get(each.name, {}).items():
-            names.setdefault(each.type.tensor_type.shape.dim[axis].dim_param, name)
-    for each in [*document.graph.input, *document.graph.output, *document.graph.value_info]:
-        for dim in each.type.tensor_type.shape.dim:
+    for value_info in document.graph.input:
+        for axis, name in graph.axes.get(value_info.name, {}).items():
+            names.setdefault(value_info.type.tensor_type.shape.dim[axis].dim_param, name)
+    for value_info in [*document.graph.input, *document.graph.output, *document.graph.value_info]:
+        for dim in value_info.type.tensor_type.shape.dim:
             if dim.dim_param:
-                dim.dim_param = names.get(dim.dim_param, "frames" if each.name in graph.outputs else dim.dim_param)
-    # Where the modules stand in the source says nothing to a reader of the file, and paths are nobody's business.
+                dim.dim_param = names.get(
+                    dim.dim_param, "frames" if value_info.name in graph.outputs else dim.dim_param
+                )
+    # Where the modules stand in the source says nothing to a reader of the file, and paths are private.
     for node in document.graph.node:
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
@@ -172,7 +174,7 @@ def record(graph: Graph) -> onnx.ModelProto:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without the exporter's remarks and graphs, which help nobody here, and without checks of shapes.
+    """Without the exporter's remarks and graphs, and without checks of shapes.
 
     While a graph is recorded, symbols stand for numbers. Where shapes are checked at run time, as in facediff's tests,
     the checks would take them for wrong types.
@@ -196,19 +198,19 @@ def quiet() -> Iterator[None]:
 
 
 def min_precision(precision: Precision) -> Precision:
-    """The precision of the graphs after the audio encoder, whose errors the steps add up."""
+    """The precision of the graphs after the audio encoder: their errors add up over the steps."""
     return "float16" if precision == "int8" else precision
 
 
 def store_weights(document: onnx.ModelProto, precision: Precision, module: torch.nn.Module) -> None:
     """Store large weights in fewer bits, each followed by a node that widens it.
 
-    Numbers that nobody has learnt, such as the kernel of spectra, stay as they are unless they take megabytes.
+    Numbers that are not learnt, such as the kernel of spectra, stay as they are unless they take megabytes.
 
     Args:
         document: changed in place.
         precision: ``int8`` rounds to 255 steps for each output channel of a convolution or a linear map.
-        module: what the graph was recorded of.
+        module: recorded in the graph.
     """
     from onnx import TensorProto, helper, numpy_helper
 
@@ -231,9 +233,9 @@ def store_weights(document: onnx.ModelProto, precision: Precision, module: torch
         else:
             # A convolution's kernel has its output channels first, the right side of a product has them last.
             axis = 0 if weight.ndim > 2 else weight.ndim - 1
-            others = tuple(place for place in range(weight.ndim) if place != axis)
-            scale = np.maximum(np.abs(weight).max(axis=others), 1e-12).astype(np.float32) / 127
-            along = scale.reshape([-1 if place == axis else 1 for place in range(weight.ndim)])
+            other_axes = tuple(dimension for dimension in range(weight.ndim) if dimension != axis)
+            scale = np.maximum(np.abs(weight).max(axis=other_axes), 1e-12).astype(np.float32) / 127
+            along = scale.reshape([-1 if dimension == axis else 1 for dimension in range(weight.ndim)])
             stored = [
                 numpy_helper.from_array(np.rint(weight / along).astype(np.int8), f"{name}_8"),
                 numpy_helper.from_array(along, f"{name}_scale"),
@@ -263,19 +265,19 @@ def described_ends(document: onnx.ModelProto) -> dict[str, list[dict[str, Any]]]
     """Inputs and outputs of a graph: name, type and shape."""
     from onnx import TensorProto
 
-    def end(each: onnx.ValueInfoProto) -> dict[str, Any]:
-        kind = each.type.tensor_type
+    def end(value_info: onnx.ValueInfoProto) -> dict[str, Any]:
+        kind = value_info.type.tensor_type
         shape = [dim.dim_param or dim.dim_value for dim in kind.shape.dim]
-        return {"name": each.name, "type": TensorProto.DataType.Name(kind.elem_type).lower(), "shape": shape}
+        return {"name": value_info.name, "type": TensorProto.DataType.Name(kind.elem_type).lower(), "shape": shape}
 
     return {
-        "inputs": [end(each) for each in document.graph.input],
-        "outputs": [end(each) for each in document.graph.output],
+        "inputs": [end(value_info) for value_info in document.graph.input],
+        "outputs": [end(value_info) for value_info in document.graph.output],
     }
 
 
 def arrays_of(
-    model: AnimationModel, graphs: Graphs, faces: list[str], further: Mapping[str, Style]
+    model: AnimationModel, graphs: Graphs, faces: list[str], extra_styles: Mapping[str, Style]
 ) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
     """What ``arrays.npz`` holds for these faces, and the names of its styles."""
     from facediff.editing.expressiveness import rest_weights
@@ -296,25 +298,25 @@ def arrays_of(
             arrays[name] = facts[name]
     if assets.identity_colours:  # of each face
         grey = np.full((assets.n_vertices, 3), 190, np.uint8)
-        own = [assets.colours_of(name) for name in faces]
-        arrays["colours"] = np.stack([grey if colours is None else colours.numpy() for colours in own])
+        face_colours = [assets.colours_of(name) for name in faces]
+        arrays["colours"] = np.stack([grey if colours is None else colours.numpy() for colours in face_colours])
     if not model.assets.space.is_vertices:
         arrays |= channel_arrays(model.assets, faces)
     if graphs.sampling is not None and graphs.sampling.noise is not None:
         arrays["noise"] = graphs.sampling.noise.numpy()
     if graphs.style != "reference":
         return arrays, list(assets.identities) if graphs.style == "identity" else []
-    chosen: dict[str, Reference | Style] = {}
+    references_by_name: dict[str, Reference | Style] = {}
     for name in [name for name in dict.fromkeys([*model.styled_identities(), *faces]) if name in faces]:
         with suppress(FaceDiffError):  # a face without a style is given one by name
-            chosen[name] = model.default_style(name)
+            references_by_name[name] = model.default_style(name)
     # Where identities do without their stored clips, these are styles by their own names, as in a checkpoint.
-    defaults = {id(style) for style in chosen.values()}
+    defaults = {id(style) for style in references_by_name.values()}
     references = model.assets.references
     stored = [references[name] for name in faces if name in references]
-    chosen |= {reference.clip: reference for reference in stored if id(reference) not in defaults}
-    chosen |= further
-    styles = {name: vector_of(style, model).numpy() for name, style in chosen.items()}
+    references_by_name |= {reference.clip: reference for reference in stored if id(reference) not in defaults}
+    references_by_name |= extra_styles
+    styles = {name: vector_of(style, model).numpy() for name, style in references_by_name.items()}
     if not styles:
         raise FaceDiffError("styles: the checkpoint holds no reference motion; train with a corpus that gives one")
     arrays["styles"] = np.stack(list(styles.values()))
@@ -407,7 +409,7 @@ def compare(
     model: AnimationModel,
     folder: Path,
     speech: npt.NDArray[np.float32],
-    further: Mapping[str, Style] | None = None,
+    extra_styles: Mapping[str, Style] | None = None,
 ) -> dict[str, Any]:
     """The folder against the model on some speech: largest difference of a number, alone and by the range."""
     import torch
@@ -417,16 +419,16 @@ def compare(
     runtime = RuntimeModel.open(folder)
     about = runtime.description
     face = about.faces[0]
-    style, chosen = None, None
+    style, reference = None, None
     if about.style_source == "reference":
         style = face if face in about.styles else about.styles[0]
-        chosen = (further or {}).get(style) or model.default_style(style)
-    heard = torch.from_numpy(speech).to(model.device)
-    wanted = model.animate(heard, identity=face, style=chosen, seed=3).vertices.numpy()
+        reference = (extra_styles or {}).get(style) or model.default_style(style)
+    audio = torch.from_numpy(speech).to(model.device)
+    expected = model.animate(audio, identity=face, style=reference, seed=3).vertices.numpy()
     stream = runtime.stream(identity=face, style=style, seed=3)
-    found = runtime.motion(speech, stream)
-    span = float(np.ptp(wanted - stream.conditions.template))
-    difference = float(np.abs(found - wanted).max())
+    exported = runtime.motion(speech, stream)
+    span = float(np.ptp(expected - stream.conditions.template))
+    difference = float(np.abs(exported - expected).max())
     return {
         "seconds": round(len(speech) / SAMPLE_RATE, 3),
         "identity": face,

@@ -75,7 +75,7 @@ class ExportedPipeline(AnimationPipeline):
 
     @property
     def corpus(self) -> str:
-        """What errors call the model's faces."""
+        """Name of the model's faces in errors."""
         return f"the exported model's corpus {self.model.description.corpus}"
 
     def direct(self, direction: Direction | None) -> None:
@@ -91,9 +91,12 @@ class ExportedPipeline(AnimationPipeline):
     def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
         """Frames for some speech (S,), and their absolute points part by part."""
         streams = [self.generator(seed) for seed in seeds]
-        first, *others = streams  # one bar shows how far all of them are
+        first, *further_streams = streams  # one bar shows how far all of them are
         progress = partial(self.track, description="seconds of speech")
-        parts = [self.model.parts(speech, first, progress), *(self.model.parts(speech, other) for other in others)]
+        parts = [
+            self.model.parts(speech, first, progress),
+            *(self.model.parts(speech, stream) for stream in further_streams),
+        ]
         return self.frames_of(len(speech)), zip(*parts, strict=True)
 
     def generator(self, seed: int) -> RuntimeStream:
@@ -102,5 +105,5 @@ class ExportedPipeline(AnimationPipeline):
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""
-        drawn = {"seed": str(seed)} if "seed" in self._metadata else {}
-        return {**self._metadata, "checkpoint": valid_text(model_name(self.options.checkpoint)), **drawn}
+        seed_entry = {"seed": str(seed)} if "seed" in self._metadata else {}
+        return {**self._metadata, "checkpoint": valid_text(model_name(self.options.checkpoint)), **seed_entry}

@@ -86,19 +86,19 @@ def animate_folder(
     if FORMATS[suffix].is_folder or (options.samples > 1 and not FORMATS[suffix].holds_several):
         fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
         raise OptionError("suffix", f"a batch writes one file for each recording; choose {fit}", suffix)
-    found = recordings(speech)
+    files = recordings(speech)
     if (directions := directions_folder(options)) is not None:
-        check_directions(options, found, directions)
+        check_directions(options, files, directions)
     correspondence = None if options.correspondence is None else Path(options.correspondence)
     if options.target_mesh is not None and correspondence is not None and not correspondence.exists():
         # Otherwise every process would fit the mesh, and a second run would see a file that decides the outputs and
         # that the records of the first one do not know.
-        write_correspondence(replace(options, quiet=True, samples=1), found)
+        write_correspondence(replace(options, quiet=True, samples=1), files)
     quiet, export = replace(options, quiet=True), replace(export, quiet=True)
     decides = {**asdict(quiet), "export": asdict(export)}
     del decides["commercial_only"]  # refuses a model, and changes no animation
     return run_folder(
-        found,
+        files,
         output,
         suffix,
         [f"{name}={json.dumps(value, default=_in_words)}" for name, value in decides.items()],
@@ -112,28 +112,28 @@ def animate_folder(
 
 
 def _in_words(value: object) -> str:
-    """A value of Python as text; of an array, whose own text leaves out its middle, the checksum of its numbers."""
+    """A value of Python as text; of an array the checksum of its numbers, since its text leaves out its middle."""
     if not hasattr(value, "__array__"):
         return str(value)
     numbers = np.asarray(value)
     return f"{numbers.dtype} {numbers.shape} {hashlib.sha256(numbers.tobytes()).hexdigest()}"
 
 
-def check_directions(options: AnimationOptions, found: Sequence[Path], folder: Path) -> None:
+def check_directions(options: AnimationOptions, recordings: Sequence[Path], folder: Path) -> None:
     """Read the keys of every recording, and say which recordings have none."""
     from facediff.editing.direction import direction_file
 
-    files = {recording: direction_file(folder, recording) for recording in found}
+    files = {recording: direction_file(folder, recording) for recording in recordings}
     without = [recording.name for recording, file in files.items() if file is None]
-    if len(without) == len(found):
-        expected = f"{found[0].stem}.json or {found[0].stem}.csv"
+    if len(without) == len(recordings):
+        expected = f"{recordings[0].stem}.json or {recordings[0].stem}.csv"
         raise OptionError("direction", f"has no keys for any recording; expected {expected}", folder)
     for file in files.values():
         if file is not None:
             check_directed(replace(options, direction=file))
     if without:
-        shown = ", ".join(without[:5]) + (" …" if len(without) > 5 else "")
-        print(f"note: {folder}: has no keys for {len(without)} of {len(found)} recordings ({shown})")
+        examples = ", ".join(without[:5]) + (" …" if len(without) > 5 else "")
+        print(f"note: {folder}: has no keys for {len(without)} of {len(recordings)} recordings ({examples})")
 
 
 def directions_folder(options: AnimationOptions) -> Path | None:
@@ -153,7 +153,7 @@ def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
 
 
 def _deciding_files(options: AnimationOptions, export: ExportOptions) -> list[Path]:
-    """The files whose content decides the animations."""
+    """The files that decide the animations."""
     source = Path(options.checkpoint)
     # A download from the hub or a clone leaves folders among the files.
     inside = sorted(path for path in source.iterdir() if path.is_file()) if is_exported(source) else model_files(source)
@@ -200,11 +200,11 @@ def write_correspondence(options: AnimationOptions, files: Sequence[Path]) -> No
 def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: list[str]) -> Animate:
     """Load what all recordings have in common, once in each process."""
     pipeline = open_pipeline(options)
-    own = directions_folder(options) is not None
+    has_directions = directions_folder(options) is not None
 
     def animate(recording: Path, output: Path) -> list[Path]:
         speech = read_recording(recording, options.max_seconds)
-        if own:
+        if has_directions:
             from facediff.editing.direction import read_direction
 
             file = next(iter(_own_files(options, recording)), None)
@@ -219,20 +219,20 @@ def recordings(paths: Sequence[Path]) -> list[Path]:
     """Recordings, and those that lie in folders (not deeper), each once."""
     from facediff.speech.audio import CONTAINERS, SUFFIXES
 
-    known = SUFFIXES + CONTAINERS
-    found: dict[Path, Path] = {}
+    suffixes = SUFFIXES + CONTAINERS
+    unique: dict[Path, Path] = {}
     for path in paths:
         files = [path]
         if path.is_dir():
-            files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in known and file.is_file()]
+            files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in suffixes and file.is_file()]
             files = [file for file in files if not file.name.startswith(".")]
             if not files:
-                raise FaceDiffError(f"{path}: holds no recording; expected {', '.join(known)}")
+                raise FaceDiffError(f"{path}: holds no recording; expected {', '.join(suffixes)}")
         if not path.exists():
             raise FaceDiffError(f"{path}: no such file or folder of recordings")
         for file in files:
-            found.setdefault(file.resolve(), file)
-    return list(found.values())
+            unique.setdefault(file.resolve(), file)
+    return list(unique.values())
 
 
 def output_names(speeches: Sequence[Path], suffix: str) -> list[str]:
@@ -244,8 +244,10 @@ def output_names(speeches: Sequence[Path], suffix: str) -> list[str]:
     names = [(speech.stem if stems[speech.stem.lower()] == 1 else speech.name) + suffix for speech in speeches]
     first: dict[str, Path] = {}
     for name, speech in zip(names, speeches, strict=True):
-        if (other := first.setdefault(name.lower(), speech)) is not speech:
-            raise FaceDiffError(f"{other} and {speech} would both give {name}; rename one, or animate them one by one")
+        if (namesake := first.setdefault(name.lower(), speech)) is not speech:
+            raise FaceDiffError(
+                f"{namesake} and {speech} would both give {name}; rename one, or animate them one by one"
+            )
     return names
 
 
@@ -275,15 +277,11 @@ def run_folder(
     Ctrl-C waits for the recordings that are being animated; the same command continues.
 
     ``command`` and ``files`` are the options and the files (checkpoint, styles …) that decide the result; ``files_of``
-    gives those of one recording in addition.
+    gives further ones of one recording.
     ``make_worker``, a function of a module, is called once in each process with the command.
     """
-    if workers is not None and workers < 1:
-        raise OptionError("workers", "expected 1 or more", workers)
     if output.exists() and not output.is_dir():
         raise OptionError("output", "is a file; expected a folder, since there are several recordings", output)
-    if not speeches:
-        raise FaceDiffError("speech: no recording; give some, or a folder of them")
     names = output_names(speeches, suffix)
     refuse_overwriting(speeches, [output / name for name in names])
     recipe = Recipe.of(command, files)
@@ -351,7 +349,7 @@ def _earlier_state(task: FileTask, retry_failed: bool) -> tuple[str, str] | None
 
 def _state_after_stop(task: FileTask) -> tuple[str, str] | None:
     """What has become of a recording that was being animated when the batch was stopped; None if it is left to do."""
-    # What is running after Ctrl-C comes to its end and records it, but nobody takes the result any more.
+    # Recordings that run after Ctrl-C come to their end and record it, but their result is not taken any more.
     if task.earlier_problem() == "" and not task.change():
         return "made", "while the batch was being stopped"
     return None
@@ -359,9 +357,9 @@ def _state_after_stop(task: FileTask) -> tuple[str, str] | None:
 
 def _print_states(speeches: Sequence[Path], states: dict[Path, tuple[str, str]]) -> None:
     rows = [(speech.name, *states.get(speech, ("left", ""))) for speech in speeches]
-    shown = rows if len(rows) <= TABLE else [row for row in rows if row[1] == "failed"]
-    if shown:
-        print_table([], shown, left=3)
+    table = rows if len(rows) <= TABLE else [row for row in rows if row[1] == "failed"]
+    if table:
+        print_table([], table, left=3)
     counts = Counter(state for _, state, _ in rows)
     summary = ", ".join(f"{count} {state}" for state, count in counts.items())
     print(f"{len(rows)} recording{'s' * (len(rows) != 1)}: {summary}", flush=True)

@@ -1,6 +1,6 @@
 """Animations as Python shows them: read from files, played in notebooks, compared, edited and written.
 
-From top to bottom: what the methods of :class:`~facediff.animation.Animation` do; several :class:`Samples` of one
+From top to bottom: methods of :class:`~facediff.animation.Animation`; several :class:`Samples` of one
 recording; :class:`Page`, animations that play side by side in a browser or a notebook; :func:`view`, which makes pages;
 :func:`read`, which opens motion files.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from facediff.editing.shapes import ShapeSet
 
 INLINE_MB = 8.0
-"""The largest page that a notebook shows; of a larger one, it shows the beginning. A notebook keeps what it shows."""
+"""The largest page that a notebook shows; of a larger one, it shows the beginning. A notebook keeps its pages."""
 TRIED_FRAMES = 64
 """Frames by which the size of a page is estimated."""
 INLINE_HEIGHT = 540
@@ -37,9 +37,9 @@ def save(animations: Sequence[Animation], path: str | Path, options: ExportKeywo
     """Write animations of one recording: :meth:`Animation.save` and :meth:`Samples.save`."""
     from facediff.export import check_used, write_animations
 
-    given = {name: value for name, value in options.items() if value is not None}
-    check_used(Path(path).suffix, given)
-    return write_animations(Path(path), animations, ExportOptions(**given))  # type: ignore[arg-type]  # of a TypedDict
+    settings = {name: value for name, value in options.items() if value is not None}
+    check_used(Path(path).suffix, settings)
+    return write_animations(Path(path), animations, ExportOptions(**settings))  # type: ignore[arg-type]  # of a TypedDict
 
 
 def compare(
@@ -115,7 +115,7 @@ class Samples(list[Animation]):
     def compare(
         self, truth: Animation, output: str | Path | None = None, *, labels: Sequence[str] | None = None
     ) -> Page:
-        """All of them next to the truth, three at most; the arguments are those of :meth:`Animation.compare`."""
+        """All of them next to the truth, three at most; with the arguments of :meth:`Animation.compare`."""
         return compare(self, truth, output, labels)
 
     def _repr_html_(self) -> str | None:
@@ -164,29 +164,29 @@ class Page:
 
     def beginning(self, frames: int) -> Page:
         """The page with the first frames only."""
-        return Page([each.part(slice(frames)) for each in self.animations], self.truth)
+        return Page([animation.part(slice(frames)) for animation in self.animations], self.truth)
 
     def _repr_html_(self) -> str | None:
         """The page in a frame of a notebook; of a page that is too large, the beginning; None without a mesh."""
         if any(animation.faces is None or not len(animation.faces) for animation in self.animations):
             return None
-        whole = frames = len(self.animations[0].vertices)
+        length = frames = len(self.animations[0].vertices)
         # A page grows with its frames nearly in proportion, but for the meshes. Tried on few frames first: packing an
         # hour only to see that it is too large would take minutes.
-        shown = self if whole <= TRIED_FRAMES else self.beginning(TRIED_FRAMES)
-        text = shown.html()
-        if shown is not self:
-            frames = min(whole, max(TRIED_FRAMES, int(TRIED_FRAMES * INLINE_MB / (len(text) / 1e6))))
-            shown = self if frames == whole else self.beginning(frames)
-            text = shown.html()
+        page = self if length <= TRIED_FRAMES else self.beginning(TRIED_FRAMES)
+        text = page.html()
+        if page is not self:
+            frames = min(length, max(TRIED_FRAMES, int(TRIED_FRAMES * INLINE_MB / (len(text) / 1e6))))
+            page = self if frames == length else self.beginning(frames)
+            text = page.html()
         while (size := len(text) / 1e6) > INLINE_MB and frames > 1:
             frames = max(1, min(frames - 1, int(0.95 * frames * INLINE_MB / size)))
-            shown = self.beginning(frames)
-            text = shown.html()
+            page = self.beginning(frames)
+            text = page.html()
         note = ""
-        if shown is not self:
+        if page is not self:
             note = (
-                f"<p>The first {shown.animations[0].seconds:.1f} of {self.animations[0].seconds:.1f} s, since a "
+                f"<p>The first {page.animations[0].seconds:.1f} of {self.animations[0].seconds:.1f} s, since a "
                 f"notebook keeps what it shows; <code>save(&quot;page.html&quot;)</code> writes all of it.</p>"
             )
         title = html.escape(" · ".join(animation.name for animation in self.animations))
@@ -219,7 +219,7 @@ def view(
 
     Args:
         animations: one, or up to four with the truth among them, of one frame rate.
-        truth: what the animations are compared with: shown first, and in heat maps.
+        truth: reference of the comparison: shown first, and in heat maps.
         labels: names to show, the truth's first.
         shortest: cut all to the shortest instead of refusing.
 
@@ -230,24 +230,24 @@ def view(
         >>> facediff.view([calm, lively], labels=["calm", "lively"]).save("both.html")  # doctest: +SKIP
         PosixPath('both.html')
     """
-    given = [animations] if isinstance(animations, Animation) else list(animations)
-    shown = [*([] if truth is None else [truth]), *given]
-    if not shown:
+    predictions = [animations] if isinstance(animations, Animation) else list(animations)
+    panels = [*([] if truth is None else [truth]), *predictions]
+    if not panels:
         raise FaceDiffError("animations: there is none to show; give at least one")
-    if labels is not None and len(labels) != len(shown):
+    if labels is not None and len(labels) != len(panels):
         raise OptionError.naming(
-            f"{{labels}}: {len(labels)} names for {len(shown)} panels; give one for each, the truth's first"
+            f"{{labels}}: {len(labels)} names for {len(panels)} panels; give one for each, the truth's first"
         )
     if labels is not None:
-        shown = [replace(animation, name=label) for animation, label in zip(shown, labels, strict=True)]
+        panels = [replace(animation, name=label) for animation, label in zip(panels, labels, strict=True)]
     if shortest:
-        frames = min(len(animation.vertices) for animation in shown)
-        shown = [animation.part(slice(frames)) for animation in shown]
+        frames = min(len(animation.vertices) for animation in panels)
+        panels = [animation.part(slice(frames)) for animation in panels]
     from facediff.export.viewer.page import check_page
 
     number = None if truth is None else 0
-    check_page(shown)
-    return Page(shown, number)
+    check_page(panels)
+    return Page(panels, number)
 
 
 def read(
@@ -271,8 +271,8 @@ def read(
         path: the file.
         like: an animation of the same topology, for the neutral face, triangles, frame rate, unit and regions.
         mesh: neutral face with triangles: .ply, .obj, .glb …
-        checkpoint: what is still missing, from a checkpoint or a loaded model.
-        identity: whose face in the checkpoint; the first one trained on if None.
+        checkpoint: source of missing facts: a checkpoint or a loaded model.
+        identity: the face in the checkpoint; the first one trained on if None.
         speech: the recording that the motion belongs to.
         frame_rate: frames a second.
         unit: unit of length: m, cm, mm, in, or a number of metres.
@@ -291,7 +291,7 @@ class SourceReader:
     """Reads motion files, and completes bare arrays of vertices by what options say.
 
     Args:
-        options: what the arrays do not say.
+        options: facts that the arrays lack.
 
     Raises:
         FaceDiffError: if an identity is named, and no checkpoint that has it.
@@ -304,7 +304,7 @@ class SourceReader:
 
     @cached_property
     def facts(self) -> tuple[AnimationFacts, AnimationFacts | None]:
-        """What the options say, which overrides a file; and what the checkpoint adds where nothing else says it."""
+        """Facts of the options, which override a file; and of the checkpoint, which complete it."""
         import numpy as np
 
         from facediff.mesh import read_mesh
@@ -348,10 +348,12 @@ class SourceReader:
             animation = replace(recorded, **complete(overrides, facts_of(recorded)))
         else:
             animation = read_animation(path, overrides, defaults)
-        for option, own in (("frame_rate", animation.frame_rate), ("unit", animation.unit)):
-            asked = getattr(self.options, option)
-            if not bare and asked not in (None, own):
-                raise OptionError(option, f"{path.name} has {own} by itself; the option is for a bare .npy", asked)
+        for option, value in (("frame_rate", animation.frame_rate), ("unit", animation.unit)):
+            option_value = getattr(self.options, option)
+            if not bare and option_value not in (None, value):
+                raise OptionError(
+                    option, f"{path.name} has {value} by itself; the option is for a bare .npy", option_value
+                )
         animation.refuse_not_finite()
         return animation
 
@@ -366,13 +368,13 @@ def solve_weights(
     from facediff.spaces.arkit import ARKIT
 
     check_shapes(shapes)
-    found = retarget_shapes(shapes, animation) if carry else read_shapes(shapes, animation.template, animation.unit)
+    shape_set = retarget_shapes(shapes, animation) if carry else read_shapes(shapes, animation.template, animation.unit)
     if only_arkit:
-        notes = [note for note in found.notes if not note.startswith(EXTRA_NOTE)]
-        if found.extra:
-            notes.append(f"not ARKit's, left out so that they take no motion: {', '.join(found.extra)}")
-        found = replace(found.only(ARKIT), notes=tuple(notes))
-    return found, solve(animation, found, options)
+        notes = [note for note in shape_set.notes if not note.startswith(EXTRA_NOTE)]
+        if shape_set.extra:
+            notes.append(f"not ARKit's, left out so that they take no motion: {', '.join(shape_set.extra)}")
+        shape_set = replace(shape_set.only(ARKIT), notes=tuple(notes))
+    return shape_set, solve(animation, shape_set, options)
 
 
 def _facts_of_model(source: Any, identity: str | None) -> AnimationFacts:  # noqa: ANN401 - a file, a folder or a model

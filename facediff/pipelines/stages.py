@@ -15,8 +15,8 @@ Direct        controls and keys                           the same, without blin
 Retarget      the motion on another mesh                  none: is judged by the whole motion
 ============  ==========================================  ==================================================
 
-Frames move on in stretches, so that memory does not grow with the recording. What needs all frames of a long one at
-once finds them in a file.
+Frames move on in stretches, so that memory does not grow with the recording. All frames of a long one
+lie in a file for stages that need them at once.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ class Each:
 
 
 class Follower(Protocol):
-    """What follows speech that arrives and gives values (m, …) of frames, such as the openness of a mouth."""
+    """Gives values (m, …) of frames for speech that arrives, such as the openness of a mouth."""
 
     def feed(self, speech: Array, /) -> npt.NDArray[np.floating]:
         """The values that are certain after more speech (n,)."""
@@ -304,7 +304,7 @@ class SpeechModel(Protocol):
     """A model with its choices made."""
 
     def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
-        """Frames for some speech (S,), and their absolute points part by part: those of each sample, (T, V, dims)."""
+        """Frames for some speech (S,), and their absolute points part by part, for each sample (T, V, dims)."""
 
     def generator(self, seed: int) -> VertexGenerator:
         """The model at the beginning of a stream."""
@@ -346,15 +346,15 @@ class Rest(Stage):
 
     @property
     def look_ahead(self) -> float:  # type: ignore[override]
-        """What the voice gate hears ahead."""
+        """Look-ahead of the voice gate."""
         return self.mouth.openness().look_ahead
 
     def apply(self, stretch: Stretch, openness: Array) -> Stretch:
-        """Frames whose mouths are as far open as a number for each (m,) says."""
+        """Frames with mouths as far open as a number for each (m,) says."""
         return replace(stretch, points=self.mouth.apply(stretch.points, openness))
 
     def whole(self, take: Take) -> None:
-        """By the pauses of what the model hears."""
+        """By the pauses of the model's speech."""
         openness = self.mouth.openness_of(take.speech, take.frames)
         for sample in take.samples:
             sample.change(lambda some: self.apply(some, openness[some.start : some.start + len(some)]))
@@ -475,7 +475,7 @@ class Direct(Stage):
         return replace(stretch, animation=animation)
 
     def whole(self, take: Take) -> None:
-        """Draw what is random for all frames at once."""
+        """Draw random numbers for all frames at once."""
         for sample in take.samples:
             amounts = self._amounts(sample.seed, 0, take.frames, sample.gestures)
             sample.change(
@@ -563,7 +563,7 @@ class Retarget(Stage):
 class AnimationStream:
     """Animates speech of any length and any sample rate while it arrives; memory does not grow with its length.
 
-    The frames are those of the recording as a whole, however the speech is cut into pieces.
+    The frames equal the whole recording's, however the speech is cut into pieces.
 
     Args:
         generator: the model at the beginning of speech.

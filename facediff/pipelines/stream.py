@@ -29,16 +29,16 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
     """Animate samples of standard input as they come, until they end or Ctrl-C ends them.
 
     Args:
-        options: of inference; what needs the whole animation is refused.
+        options: of inference; those that need the whole animation are refused.
         output: a .npy file, or ``-`` for raw float32 vertices to standard output.
-        export: what the whole animation needs of it is refused as well.
+        export: likewise.
         rate: sample rate of the 16-bit mono samples.
     """
     check_stream(options, output, export)
 
     pipeline = open_pipeline(options)
     template = pipeline.facts["template"]
-    busy, received = 0.0, 0
+    compute_seconds, received = 0.0, 0
     with sink(output, tuple(template.shape)) as write, ended_by_interrupt() as read:
         stream = pipeline.stream(rate)
         report(
@@ -49,16 +49,16 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
         for samples in pcm(sys.stdin.buffer, rate, read):
             started = time.perf_counter()
             part = stream.feed(samples)
-            busy += time.perf_counter() - started
+            compute_seconds += time.perf_counter() - started
             received += len(samples)
             write(part)
         if not received:
             raise FaceDiffError("standard input: ended before any sample came; send 16-bit mono PCM to it")
         started = time.perf_counter()
         part = stream.finish()
-        busy += time.perf_counter() - started
+        compute_seconds += time.perf_counter() - started
         write(part)
-    report(f"{received / rate:.2f} s of speech; real-time factor {busy / max(received / rate, 1e-9):.2f}")
+    report(f"{received / rate:.2f} s of speech; real-time factor {compute_seconds / max(received / rate, 1e-9):.2f}")
 
 
 WHOLE = (
@@ -69,7 +69,7 @@ WHOLE = (
 
 
 def check_stream(options: AnimationOptions, output: Path, export: ExportOptions) -> None:
-    """Refuse what streaming cannot do."""
+    """Refuse options that need the whole animation."""
     if options.direction is not None:
         options = replace(options, direction=direction_for(options.direction, Path("-"), streamed=True))
     check_options(options)
@@ -80,9 +80,9 @@ def check_stream(options: AnimationOptions, output: Path, export: ExportOptions)
             ".npy into other formats",
             output,
         )
-    given = {**options.changed(), **export.changed()}
+    options_changed = {**options.changed(), **export.changed()}
     for name in WHOLE:
-        if name in given:
+        if name in options_changed:
             raise OptionError(name, "needs the whole animation; stream to .npy, then use `facediff export`")
     if sys.stdin is None:
         raise OptionError.naming("{stream}: standard input is closed; send samples to it")
@@ -103,7 +103,7 @@ class Interrupted(KeyboardInterrupt):
 def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
     """An ``os.read`` that returns nothing more after Ctrl-C, by which most recordings end; a second Ctrl-C stops.
 
-    A handler of Ctrl-C that somebody else has installed stays in place.
+    A handler of Ctrl-C that another program has installed stays in place.
     """
     stopped = reading = False
 

@@ -1,4 +1,4 @@
-"""The pipeline for a model, whichever kind it is; and the one for a trained model, which generates with PyTorch.
+"""The pipeline for a model of any kind; and the one for a trained model, which generates with PyTorch.
 
 Short speech is generated in one pass, long speech and streams by windows.
 """
@@ -112,7 +112,7 @@ class TrainedPipeline(AnimationPipeline):
 
     @property
     def corpus(self) -> str:
-        """What errors call the model's faces."""
+        """Name of the model's faces in errors."""
         return f"the checkpoint's corpus {self.model.assets.corpus}"
 
     def direct(self, direction: Direction | None) -> None:
@@ -165,7 +165,7 @@ class TrainedPipeline(AnimationPipeline):
 
     @property
     def stream_timing(self) -> tuple[float, float]:
-        """That of the model's own windows, where it has such."""
+        """As the model's own windows, where it has such."""
         return self.model.stream_timing or super().stream_timing
 
     def generator(self, seed: int) -> FirstSample:
@@ -228,7 +228,7 @@ class TrainedPipeline(AnimationPipeline):
             )
         import torch
 
-        # A region's number fades into the rest as those of expressiveness do, so that no edge is visible.
+        # A region's number fades into the rest as in expressiveness, so that no edge is visible.
         vertex_factors = region_factors(self.facts["template"], self.facts["regions"], factors, self.corpus)
         self.model.choose_expressivity(torch.from_numpy(vertex_factors).float())
 
@@ -254,7 +254,7 @@ class FirstSample:
 
 
 def with_rig(assets: Assets) -> Assets:
-    """Assets whose channels have no rig of their own with one that can be shown.
+    """Assets with a rig that can be shown, where their channels have none.
 
     ARKit's channels get the shapes of the built-in face. Others, such as FLAME's without the user's model, get a point
     for each channel, so that their values can be written; such animations have no face to draw.
@@ -267,11 +267,11 @@ def with_rig(assets: Assets) -> Assets:
     if assets.space.kind == "arkit":
         return replace(assets, rig=Rig.of(built_in_rig(), assets))
     names = tuple(assets.space.channels[channel] for channel in assets.space.face)
-    places = np.zeros((len(names), 3))
-    places[:, 0] = np.arange(len(names))
+    points = np.zeros((len(names), 3))
+    points[:, 0] = np.arange(len(names))
     moves = np.zeros((len(names), len(names), 3))
     moves[range(len(names)), range(len(names)), 1] = 1.0
-    return replace(assets, rig=Rig.of(LinearRig(names, places, moves, None, "m", WITHOUT_FACE), assets))
+    return replace(assets, rig=Rig.of(LinearRig(names, points, moves, None, "m", WITHOUT_FACE), assets))
 
 
 def decoder_of(assets: Assets, identity: str) -> ChannelDecoder | None:
@@ -293,7 +293,7 @@ def decoder_of(assets: Assets, identity: str) -> ChannelDecoder | None:
 def facts_of(assets: Assets, identity: str | None = None) -> dict[str, Any]:
     """A checkpoint's assets as :class:`facediff.animation.Animation` takes them.
 
-    The neutral face and its colours are those of ``identity``, the first one trained on if None.
+    The neutral face and its colours belong to ``identity``, the first one trained on if None.
     """
 
     def array(value: object, kind: type) -> object:

@@ -1,8 +1,7 @@
 """Audio2Face-3D v2.3 (NVIDIA, 2025) without PyTorch: windows of speech to coefficients, and coefficients to a face.
 
 The network sees half a second around each frame's moment, so that any frame rate may be asked for and frames do not
-depend on one another; what follows the network smooths them. docs/methods.md says what is NVIDIA's and what is offered
-besides.
+depend on one another; the stages after the network smooth them. docs/methods.md tells NVIDIA's method from additions.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ class Audio2Face:
         # A length that is open has a name in place of a number.
         if not fits or any(
             len(shape) != 3
-            or any(isinstance(n, int) and n != own for n, own in zip(shape[1:], (1, expected[name]), strict=True))
+            or any(isinstance(n, int) and n != size for n, size in zip(shape[1:], (1, expected[name]), strict=True))
             for name, shape in ends.items()
         ):
             raise FaceDiffError(
@@ -91,7 +90,7 @@ class Audio2Face:
 
     @staticmethod
     def frames(samples: int, frame_rate: float) -> int:
-        """Frames whose moments lie in so many samples: frame k is at k/frame_rate seconds."""
+        """Frames with moments in so many samples: frame k is at k/frame_rate seconds."""
         return math.ceil(samples / step(frame_rate))
 
     @staticmethod
@@ -123,14 +122,14 @@ class Audio2Face:
         frames: int | None = None,
         origin: int = 0,
     ) -> Array:
-        """What the network gives for each frame.
+        """Results of the network for each frame.
 
         Args:
             audio: speech (S,) at 16 kHz, full scale 1, not normalised.
             frame_rate: frames a second.
             emotion: strengths by name, or the explicit emotion of every frame (T, E).
             start: the first frame.
-            frames: how many; all whose moments lie in the speech if None.
+            frames: how many; all with moments in the speech if None.
             origin: the sample of the recording that ``audio`` begins with, where it is the rest of a longer one.
 
         Returns:
@@ -144,8 +143,8 @@ class Audio2Face:
         else:
             emotions = np.broadcast_to(self.emotion(emotion), (count, facts.implicit + len(facts.emotions)))
         if emotions.shape != (count, facts.implicit + len(facts.emotions)):
-            given = (len(emotions), emotions.shape[1] - facts.implicit)
-            raise FaceDiffError(f"emotion: has the shape {given}; expected ({count}, {len(facts.emotions)})")
+            shape = (len(emotions), emotions.shape[1] - facts.implicit)
+            raise FaceDiffError(f"emotion: has the shape {shape}; expected ({count}, {len(facts.emotions)})")
         moments = [self.moment(start + frame, frame_rate) - origin for frame in range(count)]
         after = max(0, max(moments, default=0) + facts.buffer - facts.before - len(audio))
         padded = np.pad(audio.astype(np.float32), (facts.before, after))
@@ -181,7 +180,7 @@ class Audio2Face:
 
 
 class FaceAnimator:
-    """What makes a face of the network's results, frame after frame; it remembers what smoothing needs.
+    """Makes a face of the network's results, frame after frame; it remembers the state of the smoothing.
 
     Args:
         folder: content of the model's folder.
@@ -267,7 +266,7 @@ class FaceAnimator:
         rows = [
             math.floor(seed + frame * clock) % len(saccades) for frame in range(self._frame, self._frame + len(angles))
         ]
-        both = np.tile(saccades[rows], (1, 2)) * np.float64(settings.saccade_strength)
+        saccade_angles = np.tile(saccades[rows], (1, 2)) * np.float64(settings.saccade_strength)
         offsets = np.array(
             [
                 settings.right_eye_rot_x_offset,
@@ -276,7 +275,7 @@ class FaceAnimator:
                 settings.left_eye_rot_y_offset,
             ]
         )
-        return np.asarray(offsets + settings.eyeballs_strength * angles.astype(np.float64) + both, np.float32)
+        return np.asarray(offsets + settings.eyeballs_strength * angles.astype(np.float64) + saccade_angles, np.float32)
 
 
 def rigid_transform(rest: Array64, moved: Array64) -> Array64:

@@ -2,7 +2,7 @@
 
 ``model.json`` names all other files: ``network_info.json``, the network, the database of implicit emotions, the
 settings of the face's animator, its geometry, and the blendshapes of skin and tongue with the settings of their solver.
-Everything may come from anybody: paths stay in the folder.
+The files are not trusted: paths stay in the folder.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class NetworkFacts:
     """What ``network_info.json`` says.
 
     Attributes:
-        actor: whose face it is.
+        actor: name of the actor.
         implicit: numbers of the implicit emotion.
         emotions: names of the explicit emotions.
-        default_emotion: their strengths where nobody chooses.
+        default_emotion: their default strengths.
         skin: coefficients of the skin.
         tongue: coefficients of the tongue.
         jaw: numbers of the jaw, three for each point.
@@ -130,13 +130,13 @@ class SolverSettings:
     Attributes:
         l1: strength of the term that keeps the sum of the weights small.
         l2: strength of the term that keeps each weight small.
-        temporal: strength of the term that keeps weights near those of the frame before.
+        temporal: strength of the term that keeps weights near the previous frame's.
         symmetry: strength of the term that keeps the weights of a symmetric pair alike.
         active: whether a pose is used.
         cancel: poses with the same number, not negative, exclude one another.
         symmetric: poses with the same number are a left one and a right one.
         multipliers: factor of each weight that was solved for.
-        offsets: what is added to it then.
+        offsets: added to it then.
         template_size: diagonal of the face for which the strengths are stated.
     """
 
@@ -159,7 +159,7 @@ class Poses:
     Attributes:
         names: K names.
         neutral: (V, 3) the face at rest.
-        deltas: (K, V, 3) what a weight of 1 adds.
+        deltas: (K, V, 3) displacement at a weight of 1.
         mask: vertices that are compared; all if empty.
         settings: of the solver.
     """
@@ -266,7 +266,7 @@ def read_facts(path: Path) -> NetworkFacts:
 
 
 def read_settings(path: Path, database: Path) -> tuple[AnimatorSettings, Array]:
-    """Settings of the animator, by default those of its class, and the implicit emotion that they choose."""
+    """Settings of the animator, with the defaults of its class, and the implicit emotion that they choose."""
     content = load_json(path, remedy=REMEDY)
     arrays = read_arrays(database, ("emo_db", "emo_spec_names", "emo_spec_start", "emo_spec_size"), remedy=REMEDY)
     with damaged(path, REMEDY):
@@ -312,7 +312,7 @@ def read_poses(path: Path, config_path: Path, vertices: int) -> Poses:
     """Blendshapes and the settings of their solver."""
     arrays = read_arrays(path, remedy=REMEDY)
     with damaged(path, REMEDY):
-        names = [name for place, name in enumerate(_names(arrays, "poseNames")) if place or name != "neutral"]
+        names = [name for number, name in enumerate(_names(arrays, "poseNames")) if number or name != "neutral"]
         if not names or len(set(names)) < len(names) or "neutral" in names:
             raise ValueError("poseNames are not different names of poses")
         # Joined when all are there: names alone take no memory.
@@ -353,7 +353,7 @@ def _numbers(params: Mapping[str, Any], name: str, count: int) -> tuple[float, .
 def _pairs(params: Mapping[str, Any], name: str, count: int) -> tuple[int, ...]:
     partners = tuple(map(int, _numbers(params, name, count)))
     if any(number >= 0 and poses != 2 for number, poses in Counter(partners).items()):
-        raise ValueError(f"{name} has a number that is not that of two poses")
+        raise ValueError(f"{name} has a number that does not belong to two poses")
     return partners
 
 

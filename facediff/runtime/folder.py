@@ -1,4 +1,4 @@
-"""The folder of an exported model: what is in it, writing its description, and reading it safely.
+"""The folder of an exported model: its content, writing its description, and reading it safely.
 
 ``model.json`` says everything that is no array, ``arrays.npz`` holds templates, styles and regions, and each graph is a
 file of its own: ``speech.onnx`` and ``motion.onnx`` of every model, ``step.onnx`` of one that samples, ``start.onnx``
@@ -52,7 +52,7 @@ class Description:
         facediff: version that wrote the folder.
         corpus: that the model was trained on.
         synthetic: whether that corpus is synthetic.
-        licences: licence labels by what they cover: data, weights …
+        licences: licence labels by subject: data, weights …
         opset: of the graphs.
         precision: how weights are stored: ``float32``, ``float16`` or ``int8``.
         sizes: bytes of each file.
@@ -73,21 +73,21 @@ class Description:
         table: for each of them the factors of the noisy motion, of the last three predictions (latest first) and noise;
             where there is a sixth, of the first prediction.
         last_step: the step at which only the mean is left.
-        decoded: input of the last graph: the ``sample``, or what was ``kept`` of the last step.
+        decoded: input of the last graph: the ``sample``, or the ``kept`` numbers of the last step.
         generation: ``sampled``, by a loop over ``step``; or ``direct``, by ``motion`` alone. In a direct model, what is
             said of the loop is 0, empty, and ``last_step`` −1, as in a model that predicts no mean.
         blending: where windows go over into one another: in all ``steps`` of the loop, or in the ``motion``.
         clock: how the model counts frames, as :class:`~facediff.speech.windows.FrameClock` takes it.
-        style_source: what a style is: of a ``reference`` motion; a training ``identity``; ``none`` if there are none.
-        longest: frames at most of what is animated in one pass; 0 for any number.
+        style_source: origin of styles: a ``reference`` motion; a training ``identity``; ``none`` if there are none.
+        longest: frames at most that are animated in one pass; 0 for any number.
         drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.
         noise_of: what noise depends on: the ``clip`` and the seed, or the ``seed``.
         stillness: how far the stored references move; reference motion is rejected as another face if its static
             vertices (the array ``still``) deviate by more than a fraction of this.
         quick_steps: the diffusion steps visited at low latency; none where the model does not change its steps.
         quick_table: for each of them, as in ``table``.
-        voice_gate: the voice gate where nobody chooses one: ``energy``, or ``off`` for imported models.
-        space: what the numbers of the motion mean, as :meth:`facediff.spaces.Space.state` says it; empty for vertices.
+        voice_gate: the default voice gate: ``energy``, or ``off`` for imported models.
+        space: meaning of the motion's numbers, as :meth:`facediff.spaces.Space.state` says it; empty for vertices.
         check: the comparison with PyTorch when the folder was written.
     """
 
@@ -136,12 +136,12 @@ class Description:
 
     @property
     def known(self) -> list[str]:
-        """The identities that it was trained on and whose faces it has, or else all faces; the first is the default."""
+        """The identities that it was trained on and has faces of, or else all faces; the first is the default."""
         return [name for name in self.identities if name in self.faces] or list(self.faces)
 
     @cached_property
     def motion_space(self) -> Space:
-        """What the numbers of the motion mean."""
+        """Meaning of the motion's numbers."""
         return Space.from_state(self.space) if self.space else VERTICES
 
     @property
@@ -175,7 +175,7 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
     if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
         raise FaceDiffError(f"{path}: is not version {VERSION} of a model's description; {EXPECTED}")
     with damaged(path, REMEDY):
-        # Folders of earlier versions lack what was added since, which has a default.
+        # Folders of earlier versions lack later entries, which have defaults.
         names = {entry.name: KINDS[str(entry.type).split("[")[0]] for entry in fields(Description)}
         for name in names.keys() & content.keys():
             if not isinstance(content[name], names[name]):
@@ -219,10 +219,9 @@ def _check(description: Description) -> None:
     for steps, table in (("steps", "table"), ("quick_steps", "quick_table")):
         rows = [np.asarray(row, np.float64) for row in getattr(description, table)]
         fits = all(row.shape in ((5,), (6,)) and (np.abs(row) < 1e9).all() for row in rows)
-        if len(rows) != len(getattr(description, steps)) or not fits:
-            raise ValueError(f"{table} has not five or six numbers below 10^9 for each step")
-    if description.generation == "sampled" and not description.steps:
-        raise ValueError("steps is empty")
+        empty = steps == "steps" and description.generation == "sampled" and not rows
+        if len(rows) != len(getattr(description, steps)) or not fits or empty:
+            raise ValueError(f"{table} has not five or six numbers below 10^9 for each step, of one step at least")
     if description.frame_clock.rule not in get_args(Rule):
         raise ValueError(f"clock has the rule {quoted(description.frame_clock.rule)}")
     _ = description.motion_space

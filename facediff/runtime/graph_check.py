@@ -49,12 +49,12 @@ def problem_of_model(content: mmap.mmap) -> str:
     for number, start, end in fields(content, 0, len(content)):
         if number in (20, 25):
             return "holds functions, expected one graph of plain operators"
-        for part, *place in fields(content, start, end) if number == 7 else ():
+        for part, *span in fields(content, start, end) if number == 7 else ():
             if part == 15:
                 return "holds sparse tensors, expected dense ones"
-            if part == 5 and is_external(content, *place):
+            if part == 5 and is_external(content, *span):
                 return "has tensors in another file, expected them in this one"
-            if part == 1 and (problem := problem_of_node(content, *place)):
+            if part == 1 and (problem := problem_of_node(content, *span)):
                 return problem
     return ""
 
@@ -62,10 +62,10 @@ def problem_of_model(content: mmap.mmap) -> str:
 def problem_of_node(content: mmap.mmap, start: int, end: int) -> str:
     """Why a node is refused; empty if it is not."""
     names = {4: "", 7: ""}
-    for number, *place in fields(content, start, end):
+    for number, *span in fields(content, start, end):
         if number in names:
-            names[number] = content[slice(*place)].decode()
-        for part, *inner in fields(content, *place) if number == 5 else ():
+            names[number] = content[slice(*span)].decode()
+        for part, *inner in fields(content, *span) if number == 5 else ():
             if part in (6, 11, 22, 23):
                 return f"{quoted(names[4])} holds another graph or a sparse tensor, expected plain values"
             if part in (5, 10) and is_external(content, *inner):

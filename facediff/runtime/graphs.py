@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float32]
 
 
 class ExportedGraphs:
-    """What a folder of ``facediff export-model`` holds, ready to run.
+    """Content of a folder of ``facediff export-model``, ready to run.
 
     Args:
         description: of the folder.
@@ -78,12 +78,12 @@ class ExportedGraphs:
             self._sessions[graph] = self._load(graph)
         session = self._sessions[graph]
         declared = {node.name for node in session.get_inputs()}
-        given = {name: inputs[name] for name in inputs if name in declared}
+        arguments = {name: inputs[name] for name in inputs if name in declared}
         ends, axes = self.description.graphs[graph], dict[str, int]()
         for end in ends.get("inputs", ()):
-            axes.update(zip(end["shape"], given[end["name"]].shape, strict=False))
+            axes.update(zip(end["shape"], arguments[end["name"]].shape, strict=False))
         what = f"{graph}.onnx of {self.description.model}"
-        results = run_session(session, given, what, [end["name"] for end in ends.get("outputs", ())])
+        results = run_session(session, arguments, what, [end["name"] for end in ends.get("outputs", ())])
         for end, result in zip(ends.get("outputs", ()), results, strict=False):
             shape = tuple(axes.get(size, size) for size in end["shape"])
             flat = result.ravel()
@@ -113,7 +113,7 @@ def open_session(
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 4  # errors are raised; warnings are about optimisations that do not apply
-    # Threads that wait by spinning take the processor from whatever else runs: where something does, a frame takes
+    # Threads that wait by spinning take the processor from other programs: where some run, a frame takes
     # twice as long.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.load_model_format", "ONNX")  # as it was checked, never as another format

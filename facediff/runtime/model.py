@@ -1,7 +1,7 @@
 """An exported model at work: the path from samples to motion, of files and streams, with NumPy and ONNX Runtime.
 
-What generates the motion of a clip or of a window is in ``sampling.py``; pauses, controls and files are those of every
-model (:mod:`facediff.pipelines`), so that most programs want :func:`facediff.load` instead.
+The motion of a clip or of a window is generated in ``sampling.py``; pauses, controls and files are handled for every
+model by :mod:`facediff.pipelines`, so that most programs want :func:`facediff.load` instead.
 """
 
 from __future__ import annotations
@@ -172,18 +172,18 @@ class RuntimeModel(ExportedGraphs):
     def _face(self, choice: RuntimeChoices) -> tuple[int, RuntimeConditions]:
         """The face's place among the templates, and the conditions of its motion."""
         about, style = self.description, choice.style
-        chosen = about.known[0] if choice.identity is None else choice.identity
-        if chosen not in about.faces:
-            raise OptionError("identity", f'there is no "{chosen}": {choices(chosen, about.faces)}')
+        identity = about.known[0] if choice.identity is None else choice.identity
+        if identity not in about.faces:
+            raise OptionError("identity", f'there is no "{identity}": {choices(identity, about.faces)}')
         if choice.condition is not None and choice.condition not in about.identities:
             raise OptionError(
                 "condition",
                 f'the model was not trained on "{choice.condition}": {choices(choice.condition, about.identities)}',
             )
-        conditioned_on = chosen if choice.condition is None else choice.condition
+        conditioned_on = identity if choice.condition is None else choice.condition
         vector = RuntimeStyle(conditioned_on, np.zeros(0, np.float32))
         if about.style_source == "reference":
-            vector = style_from(chosen if style is None else style, self, chosen)
+            vector = style_from(identity if style is None else style, self, identity)
             if vector.vector.shape != self.arrays["styles"].shape[1:]:
                 raise OptionError("style", f"{vector.name} is of another model; encode it with this one")
         elif style is not None:
@@ -199,7 +199,7 @@ class RuntimeModel(ExportedGraphs):
                 raise OptionError(option, f"out of range; expected {expected}", value)
         if choice.expressivity != 1 and about.last_step < 0:
             raise OptionError("expressivity", f"{about.model} predicts no mean of its motion; omit the option")
-        face = about.faces.index(chosen)
+        face = about.faces.index(identity)
         index = about.identities.index(conditioned_on) if conditioned_on in about.identities else -1
         vertices = about.motion_space.is_vertices
         resting = self.arrays["templates"][face] if vertices else self.arrays["resting"][face][:, None]

@@ -40,10 +40,10 @@ class NormalStream:
         if count < BLOCK:
             raise ValueError(f"{count} numbers: PyTorch draws fewer than {BLOCK} by another rule")
         normal = np.empty(count, np.float32)
-        whole = count - count % BLOCK
+        even_count = count - count % BLOCK
         uniform = self._uniform(count)
-        normal[:whole] = box_muller(uniform[:whole])
-        if whole < count:
+        normal[:even_count] = box_muller(uniform[:even_count])
+        if even_count < count:
             # A rest is not drawn by itself: the last 16 numbers are drawn again.
             normal[-BLOCK:] = box_muller(self._uniform(BLOCK))
         return normal.reshape(shape)
@@ -62,7 +62,7 @@ def box_muller(uniform: Noise) -> Noise:
 
 
 def stream_of(name: str, seed: int) -> NormalStream:
-    """The stream of random numbers for a name and a seed, that of :func:`facediff.models.inference.noise_stream`."""
+    """The stream of random numbers for a name and a seed, as :func:`facediff.models.inference.noise_stream`."""
     return NormalStream(zlib.crc32(name.encode()) + seed)
 
 
@@ -114,7 +114,7 @@ class NumpyWindowNoise:
         self._drawn = 0
 
     def __call__(self, frames: int, width: int) -> Noise:
-        """The next noise (seeds, frames, width); ``frames`` are those of the window."""
+        """The next noise (seeds, frames, width); ``frames`` of the window."""
         unit = np.concatenate([self._draw(name, index, width)[:, new] for name, index, new in self.names], 1)
         self._drawn += 1
         return unit
@@ -127,7 +127,7 @@ class NumpyWindowNoise:
         if name not in self._streams:
             self._streams[name] = [stream_of(name, seed) for seed in self.seeds]
             for stream in self._streams[name]:
-                stream.draw(shape)  # what the first call gave
+                stream.draw(shape)  # the numbers of the first call
         return np.stack([stream.draw(shape) for stream in self._streams[name]])
 
 

@@ -108,24 +108,24 @@ def web_runtime(source: Path | None = None, *, say: Callable[[str], object] = la
     if source is not None:
         with source.open("rb") as stream:
             content = package().check(f"--runtime {source}", stream.read(SIZE + 1))
-    kept = cache_dir() / f"onnxruntime-web-{VERSION}"
-    files = _in_folder(kept)
+    cache = cache_dir() / f"onnxruntime-web-{VERSION}"
+    files = _in_folder(cache)
     if files is not None:
         return files
     content = content or _fetch(package(), say)
-    with atomic_folder(kept, replace=True) as staged:
+    with atomic_folder(cache, replace=True) as staged:
         for name, data in _unpacked(content).items():
             (staged / name).write_bytes(data)
-    files = _in_folder(kept)
+    files = _in_folder(cache)
     if files is None:
-        raise FaceDiffError(f"{kept}: cannot be read back as it was written; set FACEDIFF_CACHE to another folder")
+        raise FaceDiffError(f"{cache}: cannot be read back as it was written; set FACEDIFF_CACHE to another folder")
     return files
 
 
 def _in_folder(folder: Path) -> dict[str, Path] | None:
     """The files in a folder; None if one is missing or another one."""
-    for place in PLACES:
-        files = {name: folder / place / name for name in FILES}
+    for subfolder in PLACES:
+        files = {name: folder / subfolder / name for name in FILES}
         if all(path.is_file() for path in files.values()):
             return files if all(sha256(path) == FILES[name] for name, path in files.items()) else None
     return None

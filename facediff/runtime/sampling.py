@@ -28,9 +28,9 @@ class RuntimeChoices:
     """Who moves and how: the keywords of :meth:`RuntimeModel.animate` and :meth:`RuntimeModel.stream`.
 
     Attributes:
-        identity: whose face and identity; the first one trained on if None.
-        condition: the training identity that the model is conditioned on, where it is not that of the face.
-        style: what :func:`~facediff.runtime.styles.style_from` takes; that of the face's identity if None.
+        identity: face and identity; the first one trained on if None.
+        condition: the training identity that the model is conditioned on, if it differs from the face's.
+        style: as :func:`~facediff.runtime.styles.style_from` takes it; the face's own if None.
         seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
         expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
     """
@@ -120,7 +120,7 @@ def window_motion(
     sampling = SamplerRun(model, conditions, before, window.shared, new)
     noise = NumpyWindowNoise(NAME, window, [conditions.choices.seed])
     motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, [0]))
-    return motion, [kept[:, last] for kept in sampling.kept]
+    return motion, [tail[:, last] for tail in sampling.kept]
 
 
 def own_frame_count(model: ExportedGraphs, speech: WindowSpeech) -> int:
@@ -162,8 +162,8 @@ def conditioned(features: Array, conditions: RuntimeConditions) -> dict[str, npt
 def crossfade(shared: int, fixed: int) -> Array:
     """The new window's share in each shared frame: the rule of :func:`facediff.models.inference.crossfaded`."""
     # 0 up to the first frame that may change, smooth at both ends.
-    place = np.maximum(np.arange(shared, dtype=np.float32) - fixed, 0) / np.float32(max(1, shared - fixed))
-    return np.asarray(place * place * (3 - 2 * place), np.float32)
+    progress = np.maximum(np.arange(shared, dtype=np.float32) - fixed, 0) / np.float32(max(1, shared - fixed))
+    return np.asarray(progress * progress * (3 - 2 * progress), np.float32)
 
 
 class SamplerRun:
@@ -172,12 +172,12 @@ class SamplerRun:
     Args:
         model: the model.
         conditions: what motion is conditioned on.
-        before: what the window before kept, one array for each evaluation of the network; None for nothing.
+        before: tail of the window before, one array for each evaluation of the network; None for nothing.
         shared: frames that this window shares with it.
         new: the frames that are wanted; those before them are given out already.
 
     Attributes:
-        kept: what the next window is blended with, one array for each evaluation.
+        kept: tail for the blending with the next window, one array for each evaluation.
     """
 
     def __init__(
@@ -215,13 +215,13 @@ class SamplerRun:
         return motion if mean is None else np.asarray(mean + np.float32(share) * (motion - mean), np.float32)
 
     def _loop(self, features: Array, noisy: Array, noise: Draw) -> tuple[Array, Array]:
-        """The sampler's result, and what was kept of the last step."""
+        """The sampler's result, and the tail of the last step."""
         about = self.model.description
         latest: list[Array] = []
-        kept, first = noisy, None
+        tail, first = noisy, None
         for step, row in self.model.loop:
             of_noisy, *of_latest, of_noise, of_first = [*row, 0.0][:6]
-            prediction, kept = self._evaluate(features, noisy, step)
+            prediction, tail = self._evaluate(features, noisy, step)
             latest = [prediction, *latest][:3]
             first = prediction if first is None else first
             updated = np.float32(of_noisy) * noisy
@@ -231,16 +231,16 @@ class SamplerRun:
             if of_noise:
                 updated = updated + np.float32(of_noise) * self._coloured(noise(features.shape[1], about.state))
             noisy = updated
-        return noisy, kept
+        return noisy, tail
 
     def _evaluate(self, features: Array, noisy: Array, step: int) -> tuple[Array, Array]:
-        """The network's prediction at a step, blended with that of the window before."""
+        """The network's prediction at a step, blended with the window before's."""
         frames, about = features.shape[1], self.model.description
         before, share = np.zeros((1, frames, about.kept), np.float32), np.ones((1, frames), np.float32)
         if self.before is not None:
             before[:, : self.shared] = self.before[len(self.kept)]
             share[:, : self.shared] = crossfade(self.shared, self.new.start)
-        prediction, kept = self.model.run(
+        prediction, tail = self.model.run(
             "step",
             {
                 "features": features,
@@ -251,12 +251,12 @@ class SamplerRun:
                 "share": share,
             },
         )
-        self.kept.append(kept)
-        return prediction, kept
+        self.kept.append(tail)
+        return prediction, tail
 
     def _decoded(self, result: tuple[Array, Array], unit: Array) -> Array:
-        sample, kept = result
-        last = kept if self.model.description.decoded == "kept" else sample
+        sample, tail = result
+        last = tail if self.model.description.decoded == "kept" else sample
         return self.model.run("motion", {"sample": last[:, self.new], "noise": unit[:, self.new]})[0]
 
     def _start(self, unit: Array) -> Array:

@@ -56,7 +56,7 @@ with the first, and goes on with the next where the machine is too slow."""
 GATE_OPTIONS = "margin", "attack", "lead", "hold", "release"
 
 LOADS = "connect-src 'self'; worker-src 'self'; img-src data:; media-src blob:"
-"""What the page may load besides its own scripts: its worker, and sound that the reader has opened."""
+"""Loads of the page besides its own scripts: its worker, and sound that the reader has opened."""
 WORKER_POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; connect-src 'self'"
 """What scripts of the site may load: themselves, compiled WebAssembly, and files of the site."""
 HEADERS = {
@@ -75,7 +75,7 @@ TYPES = {
 }
 
 Site = Mapping[str, bytes | Path]
-"""The files of a site by their paths in it: what is made, and where the others lie."""
+"""The files of a site by their paths in it: bytes, or paths of existing files."""
 
 
 def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Path] = ()) -> Site:
@@ -119,7 +119,7 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
         )
     if "faces" not in arrays:
         raise FaceDiffError(
-            f"{title}: holds no triangles, which a picture needs; export a model whose corpus has a mesh"
+            f"{title}: holds no triangles, which a picture needs; export a model of a corpus with a mesh"
         )
     face = Animation(
         title,
@@ -146,7 +146,7 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
 
 
 def gate_facts(text: str) -> dict[str, float]:
-    """What the page's voice gate is given, of a gate's name and options."""
+    """Settings of the page's voice gate, from a gate's name and options."""
     gate = cast(EnergyGate, read_gate(text))
     return {**{name: getattr(gate, name) for name in GATE_OPTIONS}, "ahead": gate.look_ahead}
 

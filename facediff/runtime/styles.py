@@ -34,7 +34,7 @@ class RuntimeStyle:
     """A style vector.
 
     Attributes:
-        name: what it was made of.
+        name: of its source.
         vector: as the model's style encoder gives it, (S,).
     """
 
@@ -43,31 +43,31 @@ class RuntimeStyle:
 
 
 def style_from(style: object, model: ExportedGraphs, identity: str) -> RuntimeStyle:
-    """The style that was given in Python; the model's styles must be those of reference motion.
+    """The style that was given in Python; the model must take styles from reference motion.
 
     Args:
         style: the words of ``--style``; a path; names or paths with their weights; a motion as an animation, or as an
             array (T, V, 3) of absolute vertices; a style vector (S,); or what this function has returned.
         model: the model.
-        identity: whose motion an array holds, where a file's name does not say it.
+        identity: the speaker of an array, unless a file's name says it.
     """
     if isinstance(style, RuntimeStyle):
         return style
-    given = style_given(style, vertices=model.description.motion_space.is_vertices)
-    if isinstance(given, str):
-        return read_style(given, model, identity)
-    if isinstance(given, ParameterClip):
-        return _of_parameters(given, model, identity)
-    return _of_vertices(given, model, identity)
+    reference = style_given(style, vertices=model.description.motion_space.is_vertices)
+    if isinstance(reference, str):
+        return read_style(reference, model, identity)
+    if isinstance(reference, ParameterClip):
+        return _of_parameters(reference, model, identity)
+    return _of_vertices(reference, model, identity)
 
 
 def read_style(text: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:
-    """The style that the text of ``--style`` names; the model's styles must be those of reference motion.
+    """The style that the text of ``--style`` names; the model must take styles from reference motion.
 
     Args:
         text: a style's name, a file, or several of them with weights, ``F1:0.3,b.npz:0.7``.
         model: the model.
-        identity: whose motion a bare array (``.npy``) holds, where the file's name does not say it.
+        identity: the speaker of a bare array (``.npy``), unless the file's name says it.
     """
     parts = split_styles(text, model.description.styles)
     if len(parts) == 1:

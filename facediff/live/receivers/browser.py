@@ -56,7 +56,7 @@ LARGEST_STEP = np.iinfo(np.int16).max
 MESH, FRAME, SPEECH = range(3)
 MOST_VIEWERS = 16
 MOST_BYTES = 64
-"""Of what a page says; the number of a frame has at most 10."""
+"""Of a page's message; the number of a frame has at most 10."""
 ON_THE_WAY = 6
 """Frames that a page has not answered yet. A page of this machine answers within one."""
 MOST_SPEECH = 64
@@ -131,7 +131,7 @@ class Browser(Receiver):
             open_timeout=5,
             close_timeout=1,
             ping_interval=5,
-            ping_timeout=10,  # a connection whose other end has gone without a word
+            ping_timeout=10,  # a connection that has ended without a word
             server_header=None,
             logger=quiet,
         )
@@ -151,9 +151,9 @@ class Browser(Receiver):
         if method not in ("GET", "HEAD"):
             return _response(http.HTTPStatus.METHOD_NOT_ALLOWED, b"the page is read with GET\n", Allow="GET, HEAD")
         if path == "/":
-            shown = _response(http.HTTPStatus.OK, self._page, "text/html; charset=utf-8")
-            shown.body = b"" if method == "HEAD" else shown.body
-            return shown
+            response = _response(http.HTTPStatus.OK, self._page, "text/html; charset=utf-8")
+            response.body = b"" if method == "HEAD" else response.body
+            return response
         if path != "/live":
             return _response(http.HTTPStatus.NOT_FOUND, b"there is one page, at /\n")
         if len(self._viewers) >= MOST_VIEWERS:

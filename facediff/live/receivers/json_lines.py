@@ -114,7 +114,7 @@ class JsonLines(Receiver):
             data = line(content)
         except ValueError:  # NaN, as of a model that computes in too few bits
             if not self._warned:
-                log.warning("%s: frames whose numbers are not finite are left out", self.name)
+                log.warning("%s: frames with numbers that are not finite are left out", self.name)
             self._warned = True
             outbox.count_dropped()
             return
@@ -291,8 +291,8 @@ class _Clients:
                 client.close()
             self._clients.clear()
 
-    def status(self, sent: int, dropped: int) -> str:
+    def status(self, frames: int, dropped: int) -> str:
         with self._lock:
             missed = dropped + self._missed + sum(outbox.dropped for outbox in self._clients.values())
-            parts = [counted(sent, "frame"), counted(len(self._clients), "client"), f"{self.connected} so far"]
+            parts = [counted(frames, "frame"), counted(len(self._clients), "client"), f"{self.connected} so far"]
         return ", ".join(parts + ([f"{counted(missed, 'frame')} missed by slow ones"] if missed else []))

@@ -45,13 +45,13 @@ class LiveLink(UdpReceiver):
     """Unreal Engine's Live Link Face: weights of ARKit's shapes by UDP.
 
     The timecode begins at the time of day at which the first frame is sent and goes on with the numbers of the frames:
-    where frames were dropped, numbers are missing. Rotations of head and eyes are those of a model of channels, in the
-    app's mirrored frame. Elsewhere those of the eyes follow the weights of the ``eyeLook`` shapes as in the app's
-    recordings, and those of the head are what controls and acting turn it by.
+    where frames were dropped, numbers are missing. Rotations of head and eyes come from a model of channels, in the
+    app's mirrored frame. Elsewhere the eyes' follow the weights of the ``eyeLook`` shapes as in the app's
+    recordings, and the head's come from controls and acting.
 
     Args:
         address: ``livelink://HOST:PORT``; this machine's port 11111 by default.
-        subject: name of the face in Live Link; that of the performance if empty.
+        subject: name of the face in Live Link; the performance's if empty.
         device: identifier of this sender; if empty, one that is the same for a subject every time.
     """
 
@@ -95,6 +95,6 @@ class LiveLink(UdpReceiver):
 
 def seconds_of_day() -> float:
     """Seconds since midnight by this machine's clock, in its time zone."""
-    now = time.time()
-    local = time.localtime(now)
-    return local.tm_hour * 3600 + local.tm_min * 60 + local.tm_sec + now % 1
+    timestamp = time.time()
+    local = time.localtime(timestamp)
+    return local.tm_hour * 3600 + local.tm_min * 60 + local.tm_sec + timestamp % 1

@@ -104,9 +104,9 @@ class Vmc(_Osc):
             raise FaceDiffError(f"{OPTION} {self.name}: names is {names!r}; {choices(names, NAMES)}")
         self._vrm = names == "vrm"
         arkit = [live_link_name(name) for name in ARKIT] if names == "perfect_sync" else ARKIT
-        shown = SETS["vrm"] if self._vrm else arkit
+        labels = SETS["vrm"] if self._vrm else arkit
         # All but the weight, which is the last word.
-        self._parts = [message("/VMC/Ext/Blend/Val", name, 0.0)[:-4] for name in shown]
+        self._parts = [message("/VMC/Ext/Blend/Val", name, 0.0)[:-4] for name in labels]
         self._ready, self._apply = message("/VMC/Ext/OK", 1), message("/VMC/Ext/Blend/Apply")
 
     def messages(self, frame: LiveFrame) -> list[bytes]:

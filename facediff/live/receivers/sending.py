@@ -24,7 +24,7 @@ log = logging.getLogger("facediff.live")
 """Failures that do not end a performance; without a handler, Python writes them to standard error."""
 
 VISITORS = 512
-"""Connections that may wait to be accepted; the system turns away what comes beyond them at the same moment."""
+"""Connections that may wait to be accepted; the system turns away further ones at the same moment."""
 
 THIS_MACHINE = "127.0.0.1"
 
@@ -58,8 +58,8 @@ def endpoint(address: Address, default_port: int, *, listens: bool = False) -> t
         )
     host, port = address.host or THIS_MACHINE, address.port or default_port
     if not is_loopback(host):
-        others = "other machines can read the frames there" if listens else "frames leave this machine"
-        log.warning("%s: %s, unencrypted", address.text, others)
+        consequence = "other machines can read the frames there" if listens else "frames leave this machine"
+        log.warning("%s: %s, unencrypted", address.text, consequence)
     return host, port
 
 
@@ -77,14 +77,14 @@ class Datagrams:
         self.sent = self.refused = self.lost = 0
         self._warned = self._closed = False
         try:
-            family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            family, kind, protocol, _, destination = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind, protocol)
         except (OSError, UnicodeError) as error:
             raise _unreachable(address, error) from error
         try:
             self._socket.setblocking(False)
             # A connected UDP socket reports when the port is unreachable (ICMP).
-            self._socket.connect(place)
+            self._socket.connect(destination)
         except OSError as error:
             self._socket.close()
             raise _unreachable(address, error) from error
@@ -93,7 +93,7 @@ class Datagrams:
         """Send the datagrams of one frame; what cannot be sent is counted."""
         if self._closed:
             return
-        refused = lost = False
+        refused = warned = False
         for part in parts:
             try:
                 try:
@@ -104,10 +104,10 @@ class Datagrams:
             except ConnectionRefusedError:
                 refused = True
             except OSError:  # no way there now, or the queue is full
-                lost = True
+                warned = True
         self.refused += refused
-        self.lost += lost
-        self.sent += not (refused or lost)
+        self.lost += warned
+        self.sent += not (refused or warned)
         # Once: not every datagram is refused, so that each refusal would look like a program that left.
         if refused and not self._warned:
             self._warned = True
@@ -177,10 +177,10 @@ def listen(address: Address, host: str, port: int) -> socket.socket:
     """A socket that others connect to."""
     listening = None
     try:
-        place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.socket(place[0], place[1], place[2])
+        address_info = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        listening = socket.socket(address_info[0], address_info[1], address_info[2])
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(place[4])
+        listening.bind(address_info[4])
         listening.listen(VISITORS)
     except (OSError, UnicodeError) as error:
         if listening is not None:
@@ -203,10 +203,10 @@ class Outbox(Generic[Item]):
         first: an item that is taken first and never dropped.
     """
 
-    def __init__(self, take: Callable[[Item], object], most: int, name: str, first: Item | None = None) -> None:
+    def __init__(self, take: Callable[[Item], object], capacity: int, name: str, first: Item | None = None) -> None:
         self._take = take
         self._first = first
-        self._most = most
+        self._most = capacity
         self._waiting: deque[Item] = deque()
         self._changed = threading.Condition()
         self._closed = False
@@ -263,14 +263,14 @@ class ArkitWeights:
     """Weights of a frame under ARKit's names, in a protocol's order; 0 where the face has no such shape.
 
     Args:
-        performance: whose shapes they are.
+        performance: with the shapes.
         address: of the receiver, for errors.
         order: the names as the protocol has them.
     """
 
     def __init__(self, performance: Performance, address: Address, order: Sequence[str] = ARKIT) -> None:
-        place = {name: index for index, name in enumerate(performance.shapes)}
-        pairs = [(index, place[name]) for index, name in enumerate(order) if name in place]
+        columns = {name: index for index, name in enumerate(performance.shapes)}
+        pairs = [(index, columns[name]) for index, name in enumerate(order) if name in columns]
         if not pairs:
             raise FaceDiffError(
                 f"{OPTION} {address.text}: sends the weights of ARKit's 52 shapes, and the face has none; give shapes "
