@@ -176,7 +176,7 @@ def graphs_of(model: DualPathModel) -> Graphs:
         sampling=SamplingLoop(
             state=state,
             drawn=state,
-            handover=handover,
+            kept=handover,
             sampler=name_of(type(sampler)),
             steps=list(sampler.timesteps),
             table=update_table(sampler),
