@@ -94,7 +94,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "sparse": (sparse, "sparse"),
     "no inputs": (bent(node("Relu", "", "l")), "step.onnx: ONNX Runtime cannot read it"),
     "two graphs": (twice, "step.onnx"),
-    "no steps": (lambda _, facts: facts.update(steps=[], table=[]), "steps is"),
+    "no steps": (lambda _, facts: facts.update(steps=[], table=[]), "of one step at least"),
     "endless factor": (lambda _, facts: facts.update(table=[[0, 1e308, 0, 0, 0]] * 2), "table has"),
 }
 
