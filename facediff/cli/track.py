@@ -94,7 +94,7 @@ def person(
         video: a video of the person, or a folder of videos
         name: the person's name: letters, digits, dashes (default: that of the file or folder)
         output: checkpoint to write (.ckpt)
-        corpus: folder of the corpus that is made on the way (default: that of the checkpoint's name)
+        corpus: folder of the corpus that is made on the way (default: maria_corpus next to maria.ckpt)
         steps: training steps
         tracking: how faces are tracked.
         quiet: no progress bars
@@ -105,7 +105,7 @@ def person(
     from facediff.data.check import check
     from facediff.data.track.corpus import find_videos, track_people
 
-    started, root = time.monotonic(), corpus or output.with_suffix("")
+    started, root = time.monotonic(), corpus or output.with_name(f"{output.stem}_corpus")
     videos = find_videos(video, name)
     if len(videos) > 1:
         raise FaceDiffError(f"{video}: holds several people's videos; expected one's, or use `facediff data track`")

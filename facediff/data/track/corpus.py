@@ -35,7 +35,7 @@ from facediff.data.track.face import (
 )
 from facediff.data.track.model import LICENCE, POINTS, FaceModel, read_face_model
 from facediff.data.track.options import TrackingOptions
-from facediff.data.track.recording import FaceChoice, Recording, RecordingSummary, summarise, video_tracker
+from facediff.data.track.recording import Recording, RecordingSummary, summarise, video_tracker
 from facediff.data.track.topology import BROWS, EYELID_PAIRS, LIP_PAIRS, LIPS, UPPER_FACE, without_webs
 from facediff.data.track.video import SUFFIXES
 from facediff.errors import FaceDiffError, counted
@@ -43,6 +43,7 @@ from facediff.speech.audio import SAMPLE_RATE, fit_length, samples_for
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
 from facediff.utils.files import atomic, locked
+from facediff.utils.lags import correlations, peak
 from facediff.utils.licences import KNOWN, Licence
 from facediff.utils.plain_files import write_json, write_rows
 
@@ -58,6 +59,8 @@ SAMPLE = 600  # frames of a person of which the median face is made
 IRIS = 11.7  # millimetres that people's irises measure
 SMALL_FACE, SLOW, REPEATED, OPEN, NOISY_BROWS = 80, 24, 0.05, 0.9, 1.4
 """Limits of warnings: pixels, frames a second, share of pictures, share of frames, difference ratio."""
+LAGS, MOST_LAG, SYNC_SECONDS = 5, 2, 15
+"""Frames by which sound and mouth are compared and may differ, and seconds that it takes to tell."""
 CHANNELS = ("head_npy", "gaze_npy", "confidence_npy")
 
 
@@ -153,12 +156,13 @@ def track_people(
         manifest = read_manifest(out)
         begin_folder(out, STATE, recipe, "facediff data track", manifest.get("options") if manifest else None)
         tasks = tracking_tasks(videos, out / TRACKS, model, options)
-        choice = FaceChoice(options.task, options.face, options.min_face)
         pending = [task for person in tasks.values() for task in person if not task.output.exists() or task.change()]
         places: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "writes": out}
         title = "tracking" if progress else ""
         failed: dict[str, str] = {}
-        with closing(run_batch(video_tracker(choice), pending, record=_record, progress=title, **places)) as outcomes:
+        with closing(
+            run_batch(video_tracker(options), pending, record=FileTask.record, progress=title, **places)
+        ) as outcomes:
             failed |= {str(task): outcome.problem for task, outcome in outcomes if outcome.problem}
         writer = PeopleWriter(out, model, options)
         reports = [
@@ -204,10 +208,6 @@ def tracking_tasks(
         name: [FileTask(path, tracks / name / f"{path.name}.npz", recipe) for path in files]
         for name, files in videos.items()
     }
-
-
-def _record(task: FileTask, problem: str, written: object) -> None:
-    task.record(problem, written)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,9 +259,9 @@ class PeopleWriter:
         if not recordings:
             return None
         self.recordings += [recording for recording, _ in recordings]
-        target = median_face(np.concatenate([summary.sample for _, summary in recordings]), self.model)
-        laid = pose(np.concatenate([summary.sample for _, summary in recordings]), target, self.model.weights)
-        iris = iris_width(laid.faces)
+        sample = np.concatenate([summary.sample for _, summary in recordings])
+        target = median_face(sample, self.model)
+        iris = iris_width(pose(sample, target, self.model.weights).faces)
         scale = METRES * (IRIS / iris if self.options.scale == "iris" else 1.0)
         self._remove(name)
         clips: list[WrittenClip] = []
@@ -403,6 +403,12 @@ def difference_ratio(motion: Array) -> float:
     return float(np.sqrt(np.nanmean(np.square(np.diff(first, axis=0)))) / max(scale, 1e-12))
 
 
+def sound_lag(clips: Sequence[WrittenClip]) -> float:
+    """Frames by which the mouth opens after the sound, by the correlation of its gap with the loudness."""
+    scores = [correlations(clip.gaps, clip.loud, LAGS, 2 * LAGS) for clip in clips if len(clip.gaps) > 4 * LAGS]
+    return peak(np.mean(scores, axis=0)) if scores else 0.0
+
+
 def warnings(
     recordings: Sequence[tuple[Recording, RecordingSummary]], clips: Sequence[WrittenClip], rate: float
 ) -> Iterator[str]:
@@ -418,6 +424,11 @@ def warnings(
     gaps = np.concatenate([clip.gaps for clip in clips])
     if np.mean(gaps > CLOSED) > OPEN:
         yield "the mouth is open in more than 90 % of the frames; the neutral face may be wrong"
+    if len(clips) == 1:
+        yield "a person's only clip belongs to no split; more video gives more clips"
+    late = sound_lag(clips) if len(gaps) >= SYNC_SECONDS * rate else 0.0
+    if abs(late) >= MOST_LAG:
+        yield f"the sound is {abs(late):.0f} frames {'early' if late > 0 else 'late'}; shift it in the video"
     ratio = float(np.median([clip.difference_ratio for clip in clips]))
     if ratio > NOISY_BROWS:
         yield f"the motion of the brows is mostly noise (difference ratio {ratio:.2f})"

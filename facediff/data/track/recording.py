@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from facediff.data.track.face import MILLIMETRES, PosedFaces, pair_distances, pose
 from facediff.data.track.model import FaceModel, read_face_model
+from facediff.data.track.options import TrackingOptions
 from facediff.data.track.tracker import FaceTracker
 from facediff.data.track.video import Picture, read_pictures
 from facediff.errors import FaceDiffError
@@ -40,28 +41,13 @@ STILL_POINTS = (6, 168, 197, 195, 5, 4, 33, 133, 362, 263, 127, 356, 234, 454, 1
 """Points of the nose, the corners of the eyes and the outline above the mouth."""
 
 
-@dataclass(frozen=True)
-class FaceChoice:
-    """Which face of a video is tracked, and by which model.
-
-    Attributes:
-        model: ``face_landmarker.task``.
-        face: ``largest``, ``left``, or a number from the left, from 1; None where there should be one.
-        smallest: pixels of the smallest face.
-    """
-
-    model: Path | None
-    face: str | None = None
-    smallest: float = 50.0
-
-
-def video_tracker(choice: FaceChoice) -> PerWorker[FileTask, list[Path]]:
+def video_tracker(options: TrackingOptions) -> PerWorker[FileTask, list[Path]]:
     """What tracks a video and writes its files; each worker loads the model once."""
-    return PerWorker(partial(_load, choice))
+    return PerWorker(partial(_load, options))
 
 
-def _load(choice: FaceChoice) -> Any:  # noqa: ANN401 - a partial
-    return partial(_track, read_face_model(choice.model), choice)
+def _load(options: TrackingOptions) -> Any:  # noqa: ANN401 - a partial
+    return partial(_track, read_face_model(options.task), options)
 
 
 def landmark_file(output: Path) -> Path:
@@ -69,13 +55,13 @@ def landmark_file(output: Path) -> Path:
     return output.with_suffix(".npy")
 
 
-def _track(model: FaceModel, choice: FaceChoice, task: FileTask) -> list[Path]:
+def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[Path]:
     """Write the landmarks of a video, frame by frame, then times, presence, sound and counts."""
     speech = read_speech(task.source)
     if float(np.abs(speech).max()) < SILENCE:
         raise FaceDiffError(f"{task.source}: holds only silence; expected a video of a person who speaks")
-    face = {None: "largest", "left": "1"}.get(choice.face, choice.face) or "largest"
-    tracker = FaceTracker(model, face, choice.smallest)
+    face = {None: "largest", "left": "1"}.get(options.face, options.face) or "largest"
+    tracker = FaceTracker(model, face, options.min_face)
     times: list[float] = []
     presence: list[float] = []
     checks, others, repeated = 0, 0, 0
@@ -95,7 +81,7 @@ def _track(model: FaceModel, choice: FaceChoice, task: FileTask) -> list[Path]:
             presence.append(logit)
         stream.seek(0)
         write_header(stream, len(times))
-    if choice.face is None and others > OTHERS_SEEN * checks:
+    if options.face is None and others > OTHERS_SEEN * checks:
         raise FaceDiffError(
             f"{task.source}: shows several faces; say which with --face largest, left, or its number from the left"
         )

@@ -161,7 +161,10 @@ class FaceTracker:
         sides = [max(height, width), min(height, width), min(height, width) / 2]
         for side in sides[:LEVELS]:
             corners = [(x, y) for y in steps(height, side) for x in steps(width, side)]
-            found = sorted((face for corner in corners for face in self._detect(picture, corner, side)), key=by_score)
+            found = sorted(
+                (face for corner in corners for face in self._detect(picture, corner, side)),
+                key=lambda face: -face.score,
+            )
             faces: list[Face] = []
             for face in found:
                 if face.size >= self.smallest and all(face.overlap(other) <= OVERLAP for other in faces):
@@ -185,11 +188,6 @@ class FaceTracker:
             places = np.stack([centre - size / 2, centre + size / 2, *eyes]) * side + corner
             faces.append(Face(places[:2].flatten(), places[2:], float(scores[number])))
         return faces
-
-
-def by_score(face: Face) -> float:
-    """Best first."""
-    return -face.score
 
 
 def chosen(faces: Sequence[Face], face: str) -> Face | None:
