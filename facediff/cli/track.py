@@ -57,10 +57,10 @@ def track(
     """
     from facediff.data.track.corpus import find_videos, track_people
 
-    found = find_videos(videos, name)
+    recordings = find_videos(videos, name)
     with resumable(output):
         report = track_people(
-            found,
+            recordings,
             output,
             tracking,
             workers=work.workers,
@@ -122,23 +122,23 @@ def person(
         trained = run_cli("fit", options)
     trained.trainer.save_checkpoint(output)
     (who,) = videos
-    words = f"--checkpoint {output} --identity {who}"
+    options_of_speaker = f"--checkpoint {output} --identity {who}"
     tell(
         f"{output}: {who}, in {(time.monotonic() - started) / 60:.0f} min",
-        f"Next: facediff animate speech.wav {words} -o speech.mp4",
-        f"      facediff animate speech.wav {words} --target-mesh avatar.glb -o speech.glb",
+        f"Next: facediff animate speech.wav {options_of_speaker} -o speech.mp4",
+        f"      facediff animate speech.wav {options_of_speaker} --target-mesh avatar.glb -o speech.glb",
     )
 
 
-def with_tracked_styles(words: str, checkpoint: Path | str, identity: str | None) -> str:
+def with_tracked_styles(style: str, checkpoint: Path | str, identity: str | None) -> str:
     """The words of ``--style`` with a motion, on the model's face, in place of each video of a person."""
     from facediff.animation.style_files import split_styles
     from facediff.data.track.video import SUFFIXES
 
-    if not words.lower().endswith(SUFFIXES) and not any(f"{suffix}:" in words.lower() for suffix in SUFFIXES):
-        return words
+    if not style.lower().endswith(SUFFIXES) and not any(f"{suffix}:" in style.lower() for suffix in SUFFIXES):
+        return style
     names = []
-    for part in split_styles(words):
+    for part in split_styles(style):
         is_video = Path(part.name).suffix.lower() in SUFFIXES
         name = tracked_style(Path(part.name), checkpoint, identity) if is_video else part.name
         names.append(str(name) if part.weight is None else f"{name}:{part.weight!r}")
@@ -212,9 +212,9 @@ def preview_frames(recording: Recording) -> Iterator[Picture]:
         for x, y in landmarks[number, :, :2] if np.isfinite(recording.presence[number]) else ():
             cv2.circle(canvas, (round(float(x)), round(float(y))), 1, (0, 255, 0), -1)
         for curve, colour in zip(curves, ((255, 80, 80), (80, 160, 255)), strict=True):
-            shown = curve[max(0, number - picture.shape[1] // 2) : number + 1]
-            heights = canvas.shape[0] - 2 - (CURVES - 4) * shown / max(float(np.nanmax(curve)), 1e-6)
-            line = np.stack([2 * np.arange(len(shown)), heights], axis=1)[np.isfinite(heights)]
+            window = curve[max(0, number - picture.shape[1] // 2) : number + 1]
+            heights = canvas.shape[0] - 2 - (CURVES - 4) * window / max(float(np.nanmax(curve)), 1e-6)
+            line = np.stack([2 * np.arange(len(window)), heights], axis=1)[np.isfinite(heights)]
             cv2.polylines(canvas, [line.round().astype(np.int32)], False, colour, 1, cv2.LINE_AA)
         end = times[number + 1] if number + 1 < len(times) else times[number] + 1 / PREVIEW_RATE
         while written < end * PREVIEW_RATE - 1e-6:

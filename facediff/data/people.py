@@ -75,8 +75,8 @@ class People(SpeechMotionDataModule):
         folder = Path(root).expanduser()
         names = people_of(folder)
         unseen = unseen_people(names, test_people)
-        seen = extra_identities or [name for name in names if name not in unseen]
-        super().__init__(root=root, extra_identities=seen, batch_size=batch_size, **options)
+        identities = extra_identities or [name for name in names if name not in unseen]
+        super().__init__(root=root, extra_identities=identities, batch_size=batch_size, **options)
         if folder.is_dir():
             self.frame_rate = float(read_manifest(folder).get("frame_rate") or 25)  # type: ignore[misc]
 
@@ -91,14 +91,14 @@ class People(SpeechMotionDataModule):
         """The terms of the videos, as the folder states them."""
         manifest = self.root / "manifest.json"
         stated = read_manifest(self.root).get("licence") if self.root.is_dir() else None
-        own = read_licences(manifest, [stated]) if stated else [self.corpus_licence()]
-        further = [data.licences() for data in self.further.values()]
-        return merged(own, map(person_licence, self.people), *further)
+        licences = read_licences(manifest, [stated]) if stated else [self.corpus_licence()]
+        corpora = [data.licences() for data in self.further.values()]
+        return merged(licences, map(person_licence, self.people), *corpora)
 
     @cached_property
     def _splits(self) -> dict[str, str | None]:
-        listed = {name: row.get("split", "none") for name, row in read_clip_table(self.root).items()}
-        unknown = {*listed.values()} - {"train", "val", "test", "none"}
+        table = {name: row.get("split", "none") for name, row in read_clip_table(self.root).items()}
+        unknown = {*table.values()} - {"train", "val", "test", "none"}
         if unknown:
             raise FaceDiffError(
                 f"{self.root / 'clips.csv'}: has a split {min(unknown)!r}; expected train, val, test or none"
@@ -110,7 +110,7 @@ class People(SpeechMotionDataModule):
         splits: dict[str, str | None] = {}
         for person, names in by_person.items():
             for number, name in enumerate(sorted(names)):
-                split = {"test": "test_a", "none": None}.get(listed.get(name, "none"), listed.get(name))
+                split = {"test": "test_a", "none": None}.get(table.get(name, "none"), table.get(name))
                 if person not in self.extra_identities:
                     split = None if number % REFERENCE_SHARE == 0 else "test_b"
                 splits[name] = split if len(names) > 1 else None

@@ -157,11 +157,11 @@ def track_people(
         begin_folder(out, STATE, recipe, "facediff data track", manifest.get("options") if manifest else None)
         tasks = tracking_tasks(videos, out / TRACKS, model, options)
         pending = [task for person in tasks.values() for task in person if not task.output.exists() or task.change()]
-        places: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "writes": out}
+        execution: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "writes": out}
         title = "tracking" if progress else ""
         failed: dict[str, str] = {}
         with closing(
-            run_batch(video_tracker(options), pending, record=FileTask.record, progress=title, **places)
+            run_batch(video_tracker(options), pending, record=FileTask.record, progress=title, **execution)
         ) as outcomes:
             failed |= {str(task): outcome.problem for task, outcome in outcomes if outcome.problem}
         writer = PeopleWriter(out, model, options)
@@ -299,9 +299,9 @@ class PeopleWriter:
         start, end = (round(float(times[frame]) * SAMPLE_RATE) for frame in (first, stop - 1))
         frames = max(1, int((times[stop - 1] - times[first]) * rate))
         loud = loudness(fit_length(recording.speech[start:], end - start), frames, rate)
-        for one, other in cut_points(loud, self.options.clip_seconds * rate):
-            low, high = (int(np.searchsorted(times, times[first] + frame / rate - 1e-6)) for frame in (one, other))
-            yield low, stop if other == frames else high
+        for cut in cut_points(loud, self.options.clip_seconds * rate):
+            low, high = (int(np.searchsorted(times, times[first] + frame / rate - 1e-6)) for frame in cut)
+            yield low, stop if cut[1] == frames else high
 
     def _write(
         self,
@@ -356,10 +356,10 @@ class PeopleWriter:
         gaps, loud, speed = (
             np.concatenate([getattr(clip, name) for clip in clips]) for name in ("gaps", "loud", "speed")
         )
-        chosen = neutral_frames(loud, speed, gaps, CLOSED)
+        frames = neutral_frames(loud, speed, gaps, CLOSED)
         starts = np.cumsum([0, *(len(clip.gaps) for clip in clips)])
         faces = []
-        for frame in chosen:
+        for frame in frames:
             number = int(np.searchsorted(starts, frame, side="right")) - 1
             motion = np.load(self.out / "vertices_npy" / f"{clips[number].row['clip']}.npy", mmap_mode="r")
             faces.append(motion[frame - starts[number]].reshape(POINTS, 3))

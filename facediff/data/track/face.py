@@ -33,7 +33,7 @@ class PosedFaces:
     """Faces without head motion, and the motion.
 
     Attributes:
-        faces: (T, 478, 3) in millimetres, irises included; NaN where no face was seen.
+        faces: (T, 478, 3) in millimetres, irises included; NaN where no face was visible.
         angles: (T, 3) pitch (chin down), yaw (to the face's left) and roll (towards its left shoulder) in degrees.
         scales: (T,) pixels to a millimetre.
         centres: (T, 2) centre of the head in pixels.
@@ -53,17 +53,17 @@ def upright(landmarks: npt.NDArray[np.floating]) -> Array:
 def pose(landmarks: npt.NDArray[np.floating], target: Array, weights: Array) -> PosedFaces:
     """Lay landmarks (T, 478, 3) onto a face (468, 3) in millimetres by the weighted points, with scale."""
     points = upright(landmarks)
-    seen = np.isfinite(points).all(axis=(1, 2))
+    visible = np.isfinite(points).all(axis=(1, 2))
     basis = np.flatnonzero(weights)
-    rotations, shifts, scales = fit_similarities(points[seen][:, basis], target[basis], weights[None, basis], True)
+    rotations, shifts, scales = fit_similarities(points[visible][:, basis], target[basis], weights[None, basis], True)
     faces, angles = np.full(points.shape, np.nan), np.full((len(points), 3), np.nan)
     sizes, centres = np.full(len(points), np.nan), np.full((len(points), 2), np.nan)
-    faces[seen] = scales[:, None, None] * (points[seen] @ rotations.swapaxes(1, 2)) + shifts[:, None]
+    faces[visible] = scales[:, None, None] * (points[visible] @ rotations.swapaxes(1, 2)) + shifts[:, None]
     # The head's rotation takes the face to the picture, the inverse of the fit's.
     columns = rotations[:, :2].reshape(-1, 6)
     yaw, pitch, roll = np.degrees(convert(columns, "six_d", "euler")).T
-    angles[seen] = np.stack([pitch, yaw, -roll], axis=1)
-    sizes[seen], centres[seen] = 1 / scales, points[seen].mean(axis=1)[:, :2] * (1, -1)
+    angles[visible] = np.stack([pitch, yaw, -roll], axis=1)
+    sizes[visible], centres[visible] = 1 / scales, points[visible].mean(axis=1)[:, :2] * (1, -1)
     return PosedFaces(faces, angles, sizes, centres)
 
 
@@ -82,15 +82,15 @@ def median_face(landmarks: npt.NDArray[np.floating], model: FaceModel) -> Array:
 def filled(values: Array, times: Array) -> Array:
     """Values (T, ...) in which NaN is replaced by interpolation between its neighbours."""
     rows = values.reshape(len(values), -1)
-    missing = ~np.isfinite(rows).all(axis=1)
-    if not missing.any():
+    gaps = ~np.isfinite(rows).all(axis=1)
+    if not gaps.any():
         return values
-    seen = np.flatnonzero(~missing)
-    place = np.interp(times, times[seen], np.arange(len(seen), dtype=np.float64))
-    low = np.minimum(place.astype(int), max(0, len(seen) - 2))
-    share = (place - low)[:, None]
-    high = np.minimum(low + 1, len(seen) - 1)
-    return ((1 - share) * rows[seen[low]] + share * rows[seen[high]]).reshape(values.shape)
+    visible = np.flatnonzero(~gaps)
+    position = np.interp(times, times[visible], np.arange(len(visible), dtype=np.float64))
+    low = np.minimum(position.astype(int), max(0, len(visible) - 2))
+    share = (position - low)[:, None]
+    high = np.minimum(low + 1, len(visible) - 1)
+    return ((1 - share) * rows[visible[low]] + share * rows[visible[high]]).reshape(values.shape)
 
 
 def resampled(values: Array, times: Array, rate: float) -> Array:

@@ -56,5 +56,5 @@ class TrackingOptions:
     @property
     def task(self) -> Path | None:
         """The file of the model."""
-        named = os.environ.get(VARIABLE)
-        return self.model or (Path(named).expanduser() if named else None)
+        path = os.environ.get(VARIABLE)
+        return self.model or (Path(path).expanduser() if path else None)

@@ -64,14 +64,14 @@ def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[P
     tracker = FaceTracker(model, face, options.min_face)
     times: list[float] = []
     presence: list[float] = []
-    checks, others, repeated = 0, 0, 0
+    checks, crowds, repeated = 0, 0, 0
     last: Picture | None = None
     target = landmark_file(task.output)
     with atomic(target) as temporary, temporary.open("wb") as stream:
         write_header(stream, 0)
         for time, picture in read_pictures(task.source):
             if not times or time >= times[0] + checks:  # once a second
-                checks, others = checks + 1, others + (len(tracker.faces(picture)) > 1)
+                checks, crowds = checks + 1, crowds + (len(tracker.faces(picture)) > 1)
             sample = picture[::8, ::8]
             repeated += last is not None and sample.shape == last.shape and np.array_equal(sample, last)
             last = sample
@@ -81,7 +81,7 @@ def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[P
             presence.append(logit)
         stream.seek(0)
         write_header(stream, len(times))
-    if options.face is None and others > OTHERS_SEEN * checks:
+    if options.face is None and crowds > OTHERS_SEEN * checks:
         raise FaceDiffError(
             f"{task.source}: shows several faces; say which with --face largest, left, or its number from the left"
         )
@@ -157,13 +157,13 @@ class RecordingSummary:
     sample: npt.NDArray[np.float32]
 
 
-def summarise(recording: Recording, model: FaceModel, most: int) -> RecordingSummary:
+def summarise(recording: Recording, model: FaceModel, sample_size: int) -> RecordingSummary:
     """Find the usable parts of a recording; a video that cannot be used is refused.
 
     Args:
         recording: the video.
         model: the canonical face.
-        most: frames of the sample.
+        sample_size: frames of the sample.
     """
     count, source = len(recording.times), recording.source
     if count < 2 or recording.missed > MOST_MISSED * count:
@@ -183,23 +183,23 @@ def summarise(recording: Recording, model: FaceModel, most: int) -> RecordingSum
         )
     gaps = np.concatenate([pair_distances(block.faces) for block in blocks])
     still = np.concatenate([block.faces[:, STILL_POINTS] for block in blocks])
-    seen = np.flatnonzero(np.isfinite(scales))
-    steps = np.diff(seen)
-    widths = FACE_WIDTH * scales[seen]
+    frames = np.flatnonzero(np.isfinite(scales))
+    steps = np.diff(frames)
+    widths = FACE_WIDTH * scales[frames]
     with np.errstate(invalid="ignore"):
         breaks = (
-            (np.diff(recording.times[seen]) > LONGEST_GAP + 1 / recording.frame_rate)
-            | (np.abs(np.diff(np.log(scales[seen]))) > SCALE_JUMP * steps)
-            | (np.linalg.norm(np.diff(centres[seen], axis=0), axis=1) > CENTRE_JUMP * widths[1:] * steps)
-            | (np.sqrt(np.square(np.diff(still[seen], axis=0)).sum(-1).mean(-1)) > SHAPE_JUMP * steps)
+            (np.diff(recording.times[frames]) > LONGEST_GAP + 1 / recording.frame_rate)
+            | (np.abs(np.diff(np.log(scales[frames]))) > SCALE_JUMP * steps)
+            | (np.linalg.norm(np.diff(centres[frames], axis=0), axis=1) > CENTRE_JUMP * widths[1:] * steps)
+            | (np.sqrt(np.square(np.diff(still[frames], axis=0)).sum(-1).mean(-1)) > SHAPE_JUMP * steps)
         )
     starts = [0, *(np.flatnonzero(breaks) + 1)]
-    parts = [(int(seen[a]), int(seen[b - 1]) + 1) for a, b in zip(starts, [*starts[1:], len(seen)], strict=True)]
+    parts = [(int(frames[a]), int(frames[b - 1]) + 1) for a, b in zip(starts, [*starts[1:], len(frames)], strict=True)]
     parts = [(a, b) for a, b in parts if recording.times[b - 1] - recording.times[a] >= MIN_SECONDS]
     if not parts:
         raise FaceDiffError(
             f"{source}: has no {MIN_SECONDS:g} s of one face without a cut; expected a video of a person who speaks"
         )
-    usable = np.concatenate([seen[(seen >= a) & (seen < b)] for a, b in parts])
-    chosen = usable[np.linspace(0, len(usable) - 1, min(most, len(usable))).astype(int)]
-    return RecordingSummary(parts, float(np.median(widths)), gaps, np.asarray(recording.landmarks[chosen]))
+    usable = np.concatenate([frames[(frames >= a) & (frames < b)] for a, b in parts])
+    picks = usable[np.linspace(0, len(usable) - 1, min(sample_size, len(usable))).astype(int)]
+    return RecordingSummary(parts, float(np.median(widths)), gaps, np.asarray(recording.landmarks[picks]))

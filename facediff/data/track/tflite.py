@@ -55,8 +55,8 @@ class Table:
 
     def _position(self, field: int) -> int | None:
         """Where a field lies; None if the table lacks it."""
-        place = 4 + 2 * field
-        step = self._read("H", self.offsets + place) if place < self._read("H", self.offsets) else 0
+        entry = 4 + 2 * field
+        step = self._read("H", self.offsets + entry) if entry < self._read("H", self.offsets) else 0
         return self.offset + step if step else None
 
     def _vector(self, field: int) -> tuple[int, int]:

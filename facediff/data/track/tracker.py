@@ -61,11 +61,11 @@ class Face:
         """The longer side of the box."""
         return float(max(self.box[2:] - self.box[:2]))
 
-    def overlap(self, other: Face) -> float:
+    def overlap(self, second: Face) -> float:
         """Intersection over union of the boxes."""
-        sides = np.minimum(self.box[2:], other.box[2:]) - np.maximum(self.box[:2], other.box[:2])
+        sides = np.minimum(self.box[2:], second.box[2:]) - np.maximum(self.box[:2], second.box[:2])
         shared = float(np.prod(np.maximum(sides, 0)))
-        areas = [float(np.prod(face.box[2:] - face.box[:2])) for face in (self, other)]
+        areas = [float(np.prod(face.box[2:] - face.box[:2])) for face in (self, second)]
         return shared / (sum(areas) - shared)
 
 
@@ -161,13 +161,13 @@ class FaceTracker:
         sides = [max(height, width), min(height, width), min(height, width) / 2]
         for side in sides[:LEVELS]:
             corners = [(x, y) for y in steps(height, side) for x in steps(width, side)]
-            found = sorted(
+            detections = sorted(
                 (face for corner in corners for face in self._detect(picture, corner, side)),
                 key=lambda face: -face.score,
             )
             faces: list[Face] = []
-            for face in found:
-                if face.size >= self.smallest and all(face.overlap(other) <= OVERLAP for other in faces):
+            for face in detections:
+                if face.size >= self.smallest and all(face.overlap(rival) <= OVERLAP for rival in faces):
                     faces.append(face)
             if faces:
                 return faces
@@ -185,8 +185,8 @@ class FaceTracker:
             values = boxes[0, number].astype(np.float64).reshape(-1, 2) / DETECTOR_SIZE
             values[[0, 2, 3]] += self.anchors[number]
             centre, size, *eyes = values[:4]
-            places = np.stack([centre - size / 2, centre + size / 2, *eyes]) * side + corner
-            faces.append(Face(places[:2].flatten(), places[2:], float(scores[number])))
+            corners = np.stack([centre - size / 2, centre + size / 2, *eyes]) * side + corner
+            faces.append(Face(corners[:2].flatten(), corners[2:], float(scores[number])))
         return faces
 
 
