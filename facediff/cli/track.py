@@ -120,7 +120,7 @@ def person(
         options += [] if data.clips("val") else ["--trainer.limit_val_batches=0"]
         options += ["--ckpt_path", "last"] if any((root / ".training").glob(f"*/{LAST}")) else []
         trained = run_cli("fit", options)
-    trained.trainer.save_checkpoint(output)
+    trained.trainer.save_checkpoint(output, weights_only=False)
     (who,) = videos
     options_of_speaker = f"--checkpoint {output} --identity {who}"
     tell(

@@ -42,8 +42,8 @@ from facediff.errors import FaceDiffError, counted
 from facediff.speech.audio import SAMPLE_RATE, fit_length, samples_for
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
+from facediff.utils.cross_correlation import correlations, peak
 from facediff.utils.files import atomic, locked
-from facediff.utils.lags import correlations, peak
 from facediff.utils.licences import KNOWN, Licence
 from facediff.utils.plain_files import write_json, write_rows
 

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import ArrayLike
 
 from facediff.data import Puppet
 from facediff.data.track.corpus import track_people
 from facediff.data.track.face import pair_distances
 from facediff.data.track.options import VARIABLE, TrackingOptions
-from facediff.data.track.topology import EYELID_PAIRS
+from facediff.data.track.topology import EYELID_PAIRS, LIP_PAIRS
 from facediff.editing.landmarks import puppet_landmarks
 from facediff.render import Camera, Renderer, portrait, write_video
 from facediff.spaces.rotations import convert, matrices
@@ -33,6 +34,12 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Puppet:
     root = tmp_path_factory.mktemp("truth") / "corpus"
     puppet.generate(root, only=CLIPS, workers=1, progress=False)
     return Puppet(root=str(root))
+
+
+def opening(faces: np.ndarray, pairs: ArrayLike) -> np.ndarray:
+    """How far the lips are apart in height (T,): their depth is what pictures show least."""
+    upper, lower = np.asarray(pairs).T
+    return np.asarray(np.abs(faces[:, upper, 1] - faces[:, lower, 1]).mean(axis=1))
 
 
 def head_angles(frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +84,7 @@ def measure(truth: Puppet, folder: Path, size: int) -> dict[str, list[Pair]]:
         yaw, pitch = head_angles(count)
         width = [(marks["mouth_corner_left"], marks["mouth_corner_right"])]
         for quantity, one, other in (
-            ("gap", pair_distances(actual, lips), pair_distances(tracked)),
+            ("gap", opening(actual, lips), opening(tracked, LIP_PAIRS)),
             ("width", pair_distances(actual, width), pair_distances(tracked, [(291, 61)])),
             ("lids", pair_distances(actual, lids), pair_distances(tracked, EYELID_PAIRS)),
             ("jaw", actual[:, marks["chin"], 1], tracked[:, 152, 1]),
