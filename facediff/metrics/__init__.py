@@ -14,27 +14,10 @@ options and describes its numbers in words. Needs torch and torchmetrics only.
 protocol paper: lips mouth (2 vertices, 83b97b85), upper brows (2 vertices, 46584c88); frames 5, sequences 1
 
 Every metric is a torchmetrics class, a function made from it, and a name in the registry, both in snake case; the
-class's docstring has the formula, its source, its unit, and what about it is a choice:
+class's docstring has the formula, its source, its unit, and its choices. docs/metrics.md lists them.
 
-- distance from the truth: :class:`MeanVertexError`, :class:`LipVertexError`, :class:`UpperFaceVertexError`
-- amount of movement: :class:`FaceDynamicsDeviation`
-- the mouth: :class:`MouthOpeningDifference`, :class:`BilabialClosureRate`
-- timing: :class:`LipWarpingDistance` (lip DTW), :class:`TemporalMisalignment` (MTM), :class:`LipOpeningCorrelation` and
-  :class:`LipSpeedCorrelation` (lip PCC)
-- loudness: :class:`ClipSpeechLipCorrelation` and :class:`FrameSpeechLipCorrelation` (SLCC)
-- several samples: :class:`MeanEstimateError`, :class:`CoverageError`, :class:`SampleDiversity`
-- does it generate: :class:`MotionLiveliness`, :class:`SpectrumDistance`, :class:`SpreadErrorRatio`,
-  :class:`EnergyScore`
-- does it shiver: :class:`FrameStep`, :class:`DifferenceRatio`
-- the eyes: :class:`BlinkRate`, :class:`BlinkRateRatio`
-- several identities: :class:`IdentityDiversity`, :class:`StyleRetrievalAccuracy`, :class:`NearestSpeakerAccuracy`
-- motion in parameters: :class:`ChannelVariance` (Var), :class:`FramePairDistance` (Div), :class:`StepDistance` (STS),
-  :class:`ChannelDynamicsDeviation` (PDD, JDD), :class:`LipDynamicsDeviation` (LDD), :class:`FrechetDistance` (FD),
-  :class:`ShannonIndex` (SID), :class:`ResidualPartnerCorrelation` (rPCC), :class:`HeadBeatAlignment` (BA)
-- speed: :class:`RealTimeFactor`
-
-Lengths or masks say what is padding, which is never read. NaN and infinity are refused with the clip's name.
-Sums are float64 whatever comes in, and processes with unequal numbers of sequences get what one would. The options
+Lengths or masks tell the padding, which is never read. NaN and infinity are refused with the clip's name.
+Sums are float64 for any input, and processes with unequal numbers of sequences agree with a single one. The options
 that all metrics share are described in :class:`ExactMetric`, :class:`SequenceMetric` and its :meth:`update`.
 
 A new metric is a :class:`SequenceMetric` that defines :meth:`clip_value`, registered with

@@ -1,4 +1,4 @@
-"""What all metrics share: options, aligned sequences, summed states, and the function that is made from each class."""
+"""The base of all metrics: options, aligned sequences, summed states, and the functional form of a class."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ Sign = Literal["signed", "absolute"]
 """Whether a deviation keeps its sign, so that sequences can cancel, or is made positive in each sequence."""
 
 Side = Literal["prediction", "truth", "gap"]
-"""Whose score: the prediction's, the truth's, with which a prediction can be compared, or the prediction's minus
-the truth's."""
+"""The prediction's score, the truth's for comparison, or the prediction's minus the truth's."""
 
 POOLING_WORDS: dict[Pooling, str] = {
     "frames": "mean over the frames of all sequences",
@@ -80,12 +79,12 @@ def check_range(name: str, value: float, low: float, high: float = math.inf) -> 
         raise ValueError(f"{name} is {value:g}; expected {expected}")
 
 
-def whole_numbers(name: str, values: Tensor | Sequence[int], count: int, most: int) -> list[int]:
-    """One whole number from 0 to ``most`` for each of ``count`` sequences."""
+def whole_numbers(name: str, values: Tensor | Sequence[int], count: int, limit: int) -> list[int]:
+    """One whole number from 0 to ``limit`` for each of ``count`` sequences."""
     numbers = torch.as_tensor(values)
-    whole = not numbers.is_floating_point() and numbers.dtype != torch.bool
-    if numbers.numel() != count or (count and not (whole and numbers.min() >= 0 and numbers.max() <= most)):
-        raise ValueError(f"{name} must be {count} whole numbers from 0 to {most}, one for each sequence")
+    integral = not numbers.is_floating_point() and numbers.dtype != torch.bool
+    if numbers.numel() != count or (count and not (integral and numbers.min() >= 0 and numbers.max() <= limit)):
+        raise ValueError(f"{name} must be {count} whole numbers from 0 to {limit}, one for each sequence")
     return list(map(int, numbers.flatten().tolist()))
 
 
@@ -107,7 +106,7 @@ class Clip:
         speech: intensity of the speech in each frame (frames,), float64; empty if none was given.
         closures: closures of the mouth, each a first frame and the frame after the last.
         identity: number of the identity.
-        partner: (frames, channels, dims), a view: the motion of whom the person talks with.
+        partner: (frames, channels, dims), a view: the motion of the other person in a conversation.
         beats: frames in which the speech has an onset, fractions among them (beats,), float64.
     """
 
@@ -155,14 +154,7 @@ class Clips:
         return self.attach("template", self.finite("template", templates))
 
     def rows(self, name: str, values: Tensor | None, *, single: bool, ndim: int) -> list[Tensor]:
-        """Further values of each sequence, such as its speech.
-
-        Args:
-            name: of the argument.
-            values: (batch, …), or without the batch axis if ``single``.
-            single: whether there is one sequence without batch axis.
-            ndim: how many axes there are with that of the batch.
-        """
+        """Further values of each sequence, such as its speech."""
         rows = None if values is None else values.detach()[None] if single else values.detach()
         if rows is None or rows.ndim != ndim or len(rows) != len(self.clips) or not rows.is_floating_point():
             shape = "missing" if values is None else f"{values.dtype} of shape {tuple(values.shape)}"
@@ -192,20 +184,13 @@ class Clips:
         # overflow by itself, so suspicion is followed by the exact test. One transfer for the whole batch.
         half = (torch.float16, torch.bfloat16)
         sums = torch.stack([m.sum(dtype=torch.float32 if m.dtype in half else None).double() for _, _, m in sides])
-        for (name, side, motion), fine in zip(sides, sums.isfinite().tolist(), strict=True):
-            if not fine and not bool(motion.isfinite().all()):
-                bad = (~motion.isfinite()).flatten(1).any(1).nonzero()[0].item()
+        for (name, side, motion), finite in zip(sides, sums.isfinite().tolist(), strict=True):
+            if not finite and not bool(motion.isfinite().all()):
+                number = (~motion.isfinite()).flatten(1).any(1).nonzero()[0].item()
                 raise NotFiniteError(
-                    f"the {side} of {name} holds NaN or infinity, first in frame {bad}; "
+                    f"the {side} of {name} holds NaN or infinity, first in frame {number}; "
                     "a score over it would mean nothing: repair or omit this clip"
                 )
-
-
-def check_tensor(name: str, motion: object) -> None:
-    """Refuse what is no tensor, such as an array."""
-    if not isinstance(motion, Tensor):
-        kind = type(motion).__name__
-        raise ValueError(f"{name} is of type {kind}; expected a tensor (torch.from_numpy), or use the function")
 
 
 def align(
@@ -232,8 +217,6 @@ def align(
     Raises:
         ValueError: if shapes, types or lengths do not fit, a clip has no frame, or the rule refuses the lengths.
     """
-    check_tensor("prediction", prediction)
-    check_tensor("truth", truth)
     prediction, truth = prediction.detach(), truth.detach()  # scores are read, not optimised: keep no graph
     single = truth.ndim == 3
     axes = [(motion.ndim, *motion.shape[:-3], *motion.shape[-2:]) for motion in (prediction, truth)]  # all but frames
@@ -258,26 +241,25 @@ def align(
             "so `lengths` cannot hold for both; give `prediction_lengths` too"
         )
     if clip_names is None:
-        names = ["the clip"] if single else [f"clip {place} of the batch" for place in range(batch)]
+        names = ["the clip"] if single else [f"clip {row} of the batch" for row in range(batch)]
     else:
         names = [clip_names] if isinstance(clip_names, str) else list(clip_names)
     valid = _valid_frames("lengths", lengths, truth)
     effective_lengths = prediction_lengths if prediction_lengths is not None else lengths
     predicted = _valid_frames("prediction_lengths", effective_lengths, prediction)
     clips, cut_prediction, cut_truth = [], 0, 0
-    for place, (name, theirs, ours) in enumerate(zip(names, valid, predicted, strict=True)):
-        refused = ours < theirs if rule == "prediction" else ours != theirs
-        if rule != "min" and refused:
+    for row, (name, true_frames, predicted_frames) in enumerate(zip(names, valid, predicted, strict=True)):
+        refused = predicted_frames < true_frames if rule == "prediction" else predicted_frames != true_frames
+        frames = min(predicted_frames, true_frames)
+        if frames == 0 or (rule != "min" and refused):
+            problem = f"the length rule {rule!r} refuses this" if frames else "no frame is left to score"
             raise ValueError(
-                f"{name}: the prediction has {ours} frames, the truth {theirs}; the length rule {rule!r} refuses "
-                "this. Predict all frames, or choose a rule that cuts"
+                f"{name}: the prediction has {predicted_frames} frames, the truth {true_frames}; {problem}. Predict "
+                "all frames, choose a rule that cuts, or omit the clip"
             )
-        frames = min(ours, theirs)
-        if frames == 0:
-            raise ValueError(f"{name} has no frame to score: prediction {ours}, truth {theirs} frames; omit it")
-        cut_prediction += ours - frames
-        cut_truth += theirs - frames
-        clips.append(Clip(name, prediction[place, :frames], truth[place, :frames]))
+        cut_prediction += predicted_frames - frames
+        cut_truth += true_frames - frames
+        clips.append(Clip(name, prediction[row, :frames], truth[row, :frames]))
     return Clips(tuple(clips), cut_prediction, cut_truth, truth.shape[2], truth.shape[3])
 
 
@@ -322,7 +304,7 @@ class SequenceOptions(FiniteOptions, total=False):
 
 
 class UpdateOptions(TypedDict, total=False):
-    """What every :meth:`update` takes in addition to motion; see :meth:`SequenceMetric.update`."""
+    """Options of every :meth:`update` in addition to motion; see :meth:`SequenceMetric.update`."""
 
     lengths: Lengths | None
     prediction_lengths: Lengths | None
@@ -355,7 +337,7 @@ Inferred = dict[str, Callable[[Mapping[str, Any]], Any]]
 
 
 class ExactMetric(Metric):
-    """A metric that describes its definition in words and whose sums stay in float64.
+    """A metric that describes its definition in words and keeps its sums in float64.
 
     Args:
         definition: the metric in plain words, with its options.
@@ -366,7 +348,7 @@ class ExactMetric(Metric):
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
-    """What a metric that is chosen by name needs of the corpus or the run, names of :data:`facediff.metrics.NEEDS`."""
+    """Needs of a metric that is chosen by name, keys of :data:`facediff.metrics.NEEDS`."""
 
     inferred: ClassVar[Inferred] = {}
     """Constructor arguments that the functional form reads from the batch instead of being given them."""
@@ -385,7 +367,7 @@ class ExactMetric(Metric):
     ) -> None:
         super().__init__(sync_on_compute=sync_on_compute, process_group=process_group, **kwargs)
         self.definition = definition
-        # A MetricCollection merges metrics whose states have the same names and were nearly equal after the
+        # A MetricCollection merges metrics with states of the same names and were nearly equal after the
         # first batch; a signed and an absolute deviation would be merged. A state with a name of its own prevents
         # this.
         described = f"{type(self).__name__}: {definition}; {settings}"
@@ -393,7 +375,7 @@ class ExactMetric(Metric):
         self.add_state(f"definition_{mark}", torch.zeros(1, dtype=torch.int64), dist_reduce_fx="sum")
 
     def __init_subclass__(cls, **kwargs: object) -> None:
-        """List the options that ``**options`` and ``**batch`` stand for in the signatures that people and tools see."""
+        """Write the options of ``**options`` and ``**batch`` out in the signatures that people and tools see."""
         super().__init_subclass__(**kwargs)
         for name in vars(cls).keys() & {"__init__", "update"}:
             vars(cls)[name].__signature__ = _full_signature(cls, name)
@@ -420,7 +402,7 @@ class ExactMetric(Metric):
 
 @dataclass(frozen=True)
 class Coverage:
-    """What a score was taken over, and what the length rule cut.
+    """The frames and sequences of a score, and the frames that the length rule cut.
 
     Args:
         frames: frames scored. A metric that looks at some frames only counts those, see there.
@@ -441,7 +423,7 @@ class SequenceMetric(ExactMetric):
     """Base of metrics that give each sequence one number and pool these; a new metric defines :meth:`clip_value`.
 
     The states are sums (float64) and counts (int64) of fixed size, so that memory does not grow and processes
-    that saw different numbers of sequences, or none, reduce to what one process gets. They stay in these
+    that saw different numbers of sequences, or none, reduce to the result of one process. They stay in these
     types when the module that holds the metric is converted to another precision.
 
     Under several processes :meth:`compute` and :meth:`coverage` are collective: call them on every rank, also on one
@@ -454,7 +436,7 @@ class SequenceMetric(ExactMetric):
         length_rule: ``"min"`` cuts prediction and truth to the shorter of the two; ``"error"`` refuses different
             lengths; ``"prediction"`` cuts the prediction and refuses one that is shorter than the truth.
         check_finite: whether :meth:`update` refuses NaN and infinity; off only where the caller has looked already.
-        **kwargs: those of :class:`ExactMetric`.
+        **kwargs: as of :class:`ExactMetric`.
 
     >>> class LastFrameError(SequenceMetric):
     ...     words = "mean distance in the last frame; mean over sequences [unit]"
@@ -477,7 +459,7 @@ class SequenceMetric(ExactMetric):
     """Whether the order of frames counts, so that none can be left out of a sequence."""
 
     latest: Tensor | None
-    """What :meth:`clip_value` gave for each sequence of the last update, (batch,) float64; None before the first."""
+    """The results of :meth:`clip_value` in the last update, (batch,) float64; None before the first."""
     indices: Tensor | None
     total: Tensor
     counts: Tensor
@@ -494,16 +476,16 @@ class SequenceMetric(ExactMetric):
     ) -> None:
         check_option("pooling", pooling, Pooling)
         check_option("length rule", length_rule, LengthRule)
-        named = None if region is None else as_region(region, "vertices")
+        checked_region = None if region is None else as_region(region, "vertices")
         definition = (definition or self.words).replace("{pooling}", POOLING_WORDS[pooling])
-        definition = definition.replace("{region}", "all vertices" if named is None else str(named))
+        definition = definition.replace("{region}", "all vertices" if checked_region is None else str(checked_region))
         super().__init__(definition=definition, settings=length_rule, **kwargs)
         self.pooling: Pooling = pooling
         self.length_rule: LengthRule = length_rule
         self.check_finite = check_finite
-        self.region: Region | None = named
+        self.region: Region | None = checked_region
         self.latest = None
-        self.register_buffer("indices", None if named is None else named.tensor(), persistent=False)
+        self.register_buffer("indices", None if checked_region is None else checked_region.tensor(), persistent=False)
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(5, dtype=torch.int64), dist_reduce_fx="sum")
 
@@ -616,7 +598,7 @@ class LipMetric(SequenceMetric):
 
     Args:
         lips: lip vertices, a :class:`Region` or indices.
-        **options: those of :class:`SequenceOptions`.
+        **options: see :class:`SequenceOptions`.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lips",)
@@ -629,22 +611,23 @@ class LipMetric(SequenceMetric):
 # The functional form.
 
 
-_NOT_IN_FUNCTIONS = {"definition", "check_finite", "sync_on_compute", "process_group"}
+INTERNAL = frozenset({"definition", "check_finite", "sync_on_compute", "process_group"})
+"""Arguments of constructors that neither functions nor names with options take."""
 
 
 def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> Callable[..., Tensor]:
     """The functional form of a metric: its class, used once on one sequence or one padded batch.
 
-    Both give the same number by construction. The function takes the motion that :meth:`update` takes, then what the
-    class is made of (regions, pairs), then the options of both by keyword. NumPy arrays do where tensors do. Processes
-    are not brought together.
+    Both give the same number by construction. The function takes the motion that :meth:`update` takes, then regions,
+    pairs and other arguments that the class requires, then the options of both by keyword. NumPy arrays do where
+    tensors do. Processes are not brought together.
 
     Args:
         metric: the class; the function has its name in snake case.
-        positional: keywords of :meth:`update` that the function also takes by position, after those of the class.
+        positional: keywords of :meth:`update` that the function also takes by position, after the class's.
 
     Returns:
-        A function of proper name, signature and docstring, which returns a float64 scalar.
+        A function that returns a float64 scalar.
     """
     constructor = inspect.signature(metric).parameters
     updated = {name: p for name, p in inspect.signature(metric.update).parameters.items() if name != "self"}
@@ -653,8 +636,7 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
     order |= {name: p for name, p in constructor.items() if p.kind is by_place and name not in metric.inferred}
     order |= {name: updated[name].replace(kind=by_place, default=inspect.Parameter.empty) for name in positional}
     for name, parameter in (updated | constructor).items():
-        internal = parameter.kind is inspect.Parameter.VAR_KEYWORD or name in _NOT_IN_FUNCTIONS
-        if name not in order and name not in metric.inferred and not internal:
+        if name not in {*order, *metric.inferred, *INTERNAL} and parameter.kind is not inspect.Parameter.VAR_KEYWORD:
             order[name] = parameter
     signature = inspect.Signature(list(order.values()), return_annotation=Tensor)
 
@@ -668,22 +650,10 @@ def functional(metric: type[ExactMetric], *, positional: Sequence[str] = ()) -> 
         one.update(**batch)
         return typing.cast(Tensor, one.compute())
 
-    name = re.sub(r"(?<!^)(?=[A-Z])", "_", metric.__name__).lower()
-    described: dict[str, str] = {}
-    for base in reversed(metric.__mro__):
-        if issubclass(base, ExactMetric):
-            described |= _arguments(base.update) | _arguments(base)
-    summary, _, _ = (inspect.getdoc(metric) or "").partition("\n")
-    function.__name__ = function.__qualname__ = name
+    function.__name__ = function.__qualname__ = re.sub(r"(?<!^)(?=[A-Z])", "_", metric.__name__).lower()
     function.__module__ = metric.__module__
-    function.__doc__ = (
-        f"{summary}\n\nThe functional form of :class:`{metric.__name__}`, whose docstring has formula, unit and "
-        "source.\n\n"
-        "Args:\n"
-        + "\n".join(f"    {name}: {described.get(name, 'see the class.')}" for name in order)
-        + "\n\nReturns:\n    float64 scalar.\n\nRaises:\n    ValueError: as the class and its ``update``.\n"
-    )
-    function.__signature__ = signature  # type: ignore[attr-defined]  # what help() and IDEs show
+    function.__doc__ = f"The functional form of :class:`{metric.__name__}`, which has the formula and all arguments."
+    function.__signature__ = signature  # type: ignore[attr-defined]  # for help() and IDEs
     return function
 
 
@@ -697,18 +667,11 @@ def as_tensor(value: Any) -> Any:  # noqa: ANN401 - whatever a metric takes
     return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
 
 
-def _arguments(documented: object) -> dict[str, str]:
-    """What a docstring's section ``Args`` says of each name."""
-    section = re.search(r"^Args:\n((?:    .*\n?|\n)+)", inspect.getdoc(documented) or "", re.MULTILINE)
-    entries = re.findall(r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", section[1] if section else "", re.MULTILINE)
-    return {name: text.rstrip() for name, text in entries}
-
-
 def describe_column(metric: Metric) -> dict[str, str | None]:
-    """What a table needs to know of a score to pool it again and to compare it.
+    """The facts with which a table pools a score again and compares it.
 
     Returns:
-        ``pooling``: ``frames`` or ``sequences``; None if the score is no mean of those of sequences. ``better``:
+        ``pooling``: ``frames`` or ``sequences``; None if the score is no mean over sequences. ``better``:
         ``lower``, ``higher`` or ``zero``, which is the best value of a signed one; None if no direction is better.
 
     >>> from facediff.metrics import FaceDynamicsDeviation

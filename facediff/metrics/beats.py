@@ -26,11 +26,10 @@ def onsets(waveform: Tensor, sample_rate: int) -> Tensor:
     """Moments at which sounds begin, in seconds (onsets,), float64, by spectral flux.
 
     Magnitudes |X[n, f]| of windows of 32 ms (Hann), 10 ms apart, of the sound divided by its largest absolute
-    value, are compressed as log(1 + 100 |X|), with the window's sum as unit. The flux is the mean over f of what
-    they rise by from a window to the next, divided by its largest value. An onset is a window whose flux is the
-    largest within 30 ms, and by 0.07 above the mean of the flux from 100 ms before to 100 ms after it. The time is
-    that of the window's centre. Silence has none. Our own detector, so that the metrics need no further library;
-    others find others.
+    value, are compressed as log(1 + 100 |X|), with the window's sum as unit. The flux is the mean rise over f
+    from a window to the next, divided by its largest value. An onset is a window with the largest flux within 30 ms,
+    by 0.07 above the mean of the flux from 100 ms before to 100 ms after it. The time is the window's centre. Silence
+    has none. Our own detector, so that the metrics need no further library; others find others.
 
     Args:
         waveform: (samples,), floating point.
@@ -57,8 +56,8 @@ def onsets(waveform: Tensor, sample_rate: int) -> Tensor:
     padded = torch.nn.functional.pad(flux, (before, after), value=float("nan"))
     mean = padded.unfold(0, before + after + 1, 1).nanmean(1)
     nearby = torch.nn.functional.pad(flux, (apart, apart)).unfold(0, 2 * apart + 1, 1).amax(1)
-    chosen = ((flux == nearby) & (flux > mean + THRESHOLD)).nonzero().flatten()
-    return chosen.double() * hop / sample_rate
+    peaks = ((flux == nearby) & (flux > mean + THRESHOLD)).nonzero().flatten()
+    return peaks.double() * hop / sample_rate
 
 
 @metric.register("head_beat_alignment")
@@ -66,11 +65,11 @@ class HeadBeatAlignment(OneSideMetric):
     """BA: are there slow moments of the head near the onsets of the speech? Mean over onsets of exp(−d² / (2v)).
 
     d is the distance in frames from an onset to the nearest minimum of the head's speed, which is ‖x[t + 1] − x[t]‖₂
-    over the head's channels, at t + ½, under a Gaussian of standard deviation σ frames. From 0 to 1; a prediction whose
-    speed has no minimum counts 0, a sequence without onsets is left out. Then the mean over sequences.
+    over the head's channels, at t + ½, under a Gaussian of standard deviation σ frames. From 0 to 1; a prediction
+    without a minimum of speed counts 0, a sequence without onsets is left out. Then the mean over sequences.
 
-    **Numbers of different σ, v and frame rates cannot be compared**, and everybody has others: σ 5 and v 9 are the
-    defaults of the scripts that stem from Bailando, 3/7 and 2/8 occur too. The onsets are those of :func:`onsets`;
+    **Numbers of different σ, v and frame rates cannot be compared**, and every paper has its own: σ 5 and v 9 are the
+    defaults of the scripts that stem from Bailando, 3/7 and 2/8 occur too. The onsets come from :func:`onsets`;
     others take librosa's onsets or beats.
 
     Args:
@@ -133,13 +132,10 @@ class HeadBeatAlignment(OneSideMetric):
     def update(
         self, prediction: Tensor, truth: Tensor, *, waveform: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
-        """Add a batch of sequences with their speech.
+        """Add a batch of sequences (batch, frames, channels, 1) with their speech.
 
-        Args:
-            prediction: (batch, frames, channels, 1) or one sequence (frames, channels, 1), floating point.
-            truth: of the same shape as the prediction.
-            waveform: the sound (batch, samples), or (samples,) of one sequence, beginning with the first frame.
-                Samples beyond the scored frames are not read.
+        ``waveform`` is the sound (batch, samples), or (samples,) of one sequence, beginning with the first frame.
+        Samples beyond the scored frames are not read.
         """
         clips = self.align(prediction, truth, **batch)
         sounds = clips.rows("waveform", waveform, single=truth.ndim == 3, ndim=2)

@@ -1,8 +1,8 @@
 """Metrics by name: ``lip_vertex_error:squared=false`` becomes a metric that is made for a corpus and fed from it.
 
-A metric states as class data what it ``needs`` (the lips, the speech, several samples …). Whoever scores says in a
-:class:`Context` what the corpus or the run has; :meth:`Request.build` brings the two together, and :func:`feed` hands
-each metric those of a batch's inputs that its :meth:`update` takes.
+A metric states its ``needs`` as class data (the lips, the speech, several samples …). A :class:`Context` has the data
+of the corpus or the run; :meth:`Request.build` brings the two together, and :func:`feed` hands
+each metric the inputs of a batch that its :meth:`update` takes.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from typing import Any, cast
 import torch
 from torchmetrics import Metric
 
-from facediff.errors import FaceDiffError, choices
-from facediff.metrics.base import SequenceMetric
+from facediff.errors import FaceDiffError, choices, damaged
+from facediff.metrics.base import INTERNAL, SequenceMetric
 from facediff.metrics.channels import Moment, split_frames
 from facediff.metrics.regions import Region
-from facediff.registry import UnknownComponentError
 from facediff.registry import metric as metrics
 
 NEEDS: dict[str, str] = {
@@ -28,7 +27,7 @@ NEEDS: dict[str, str] = {
     "lip_pairs": "pairs of inner-lip vertices",
     "lid_pairs": "pairs of eyelid vertices",
     "channels": "motion in parameters",
-    "partner": "the motion of whom the person talks with",
+    "partner": "the motion of the other person in the conversation",
     "speaking": "who speaks when",
     "gallery": "recordings of all speakers",
     "template": "each speaker's neutral face",
@@ -40,7 +39,7 @@ NEEDS: dict[str, str] = {
     "style": "style vectors",
     "time": "how long inference took",
 }
-"""What a metric may need, in words.
+"""Needs of metrics, in words.
 
 The regions come as the constructor's ``lips`` and ``upper``, either sort of pairs as ``pairs`` (with
 ``frames_per_second`` for eyelids), channels as ``region``, recordings as ``gallery``; ``speech`` as ``sample_rate`` and
@@ -52,23 +51,23 @@ The regions come as the constructor's ``lips`` and ``upper``, either sort of pai
 MOMENTS: dict[str, Moment] = {"s_": "speaking", "l_": "listening"}
 """Prefixes of metrics that are taken in some frames only."""
 OF_ALL_FRAMES = {"closures", "waveform"}
-"""What metrics compare motion with by its place in the clip, so that no frames can be left out of it."""
+"""Inputs that belong to certain frames of a clip, so that no frames can be left out."""
 
-_NOT_CHOSEN = {"definition", "check_finite", "sync_on_compute", "process_group", "n_identities", "sample_rate"}
+_HIDDEN = INTERNAL | {"n_identities", "sample_rate"}
 
 
 @dataclass(frozen=True)
 class Context:
-    """What a corpus or a run has for metrics.
+    """The data that a corpus or a run has for metrics.
 
     Args:
         has: by need, the constructor arguments that meet it; empty where the need is met with each batch.
-        missing: by need, what to do to have it, or why it cannot be had.
+        reasons: by need, the reason why it is not met, or the way to meet it.
         channels: regions of channels by name, for metrics that read channels; ``all`` among them.
     """
 
     has: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    missing: Mapping[str, str] = field(default_factory=dict)
+    reasons: Mapping[str, str] = field(default_factory=dict)
     channels: Mapping[str, Region] = field(default_factory=dict)
 
 
@@ -86,12 +85,12 @@ class Request:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What the metric needs, words of :data:`NEEDS`."""
+        """The metric's needs, keys of :data:`NEEDS`."""
         implementation = metrics.get(self.name)
-        own = tuple(getattr(implementation, "needs", ()))
+        inputs = tuple(getattr(implementation, "needs", ()))
         by_option = getattr(implementation, "option_needs", {})
-        own += tuple(need for option, need in by_option.items() if self.options.get(option))
-        return own if self.moment == "all" else (*own, "speaking")
+        inputs += tuple(need for option, need in by_option.items() if self.options.get(option))
+        return inputs if self.moment == "all" else (*inputs, "speaking")
 
     @property
     def of_channels(self) -> bool:
@@ -107,10 +106,10 @@ class Request:
         """The metric, made for a corpus."""
         lacking = [need for need in self.needs if need not in context.has]
         if lacking:
-            reasons = "; ".join(
-                f"{NEEDS.get(need, need)} ({context.missing.get(need, 'not available here')})" for need in lacking
+            problems = "; ".join(
+                f"{NEEDS.get(need, need)} ({context.reasons.get(need, 'not available here')})" for need in lacking
             )
-            raise FaceDiffError(f"metric {self.text}: needs {reasons}")
+            raise FaceDiffError(f"metric {self.text}: needs {problems}")
         implementation = metrics.get(self.name)
         accepted = inspect.signature(implementation).parameters
         arguments = {key: value for need in self.needs for key, value in context.has[need].items() if key in accepted}
@@ -125,10 +124,8 @@ class Request:
             if region not in regions:
                 raise FaceDiffError(f"metric {self.text}: there is no region {region!r}: {choices(region, regions)}")
             options["region"] = regions[region]
-        try:
+        with damaged(f"metric {self.text}", "change its options"):
             return cast(Metric, implementation(**arguments | options))
-        except (TypeError, ValueError) as error:
-            raise FaceDiffError(f"metric {self.text}: {error}") from error
 
 
 def parse(text: str) -> Request:
@@ -146,15 +143,13 @@ def parse(text: str) -> Request:
     for prefix, frames in MOMENTS.items():
         if plain.startswith(prefix) and plain.partition(":")[0] not in metrics.names():
             plain, moment = plain.removeprefix(prefix), frames
-    try:
-        name, options = metrics.read(plain, _NOT_CHOSEN)
-    except UnknownComponentError as error:
-        # It is an AttributeError too, which a torch module that parses in a property would report as one of its own.
-        raise FaceDiffError(str(error)) from error
+    # An unknown name is an AttributeError too, which a torch module that parses in a property would report as its own.
+    with damaged(f"metric {text.strip()}", "choose another"):
+        name, options = metrics.read(plain, _HIDDEN)
     if moment != "all":
-        taken = inspect.signature(metrics.get(name).update).parameters.keys()
+        parameters = inspect.signature(metrics.get(name).update).parameters.keys()
         ordered = getattr(metrics.get(name), "in_order", False)
-        if not {"prediction", "truth"} <= taken or OF_ALL_FRAMES & taken or ordered:
+        if not {"prediction", "truth"} <= parameters or OF_ALL_FRAMES & parameters or ordered:
             raise FaceDiffError(
                 f"metric {text}: {name} scores no frames of prediction and truth by themselves; omit the prefix"
             )
@@ -162,25 +157,19 @@ def parse(text: str) -> Request:
 
 
 def feed(metric: Metric, inputs: Mapping[str, Any], moment: Moment = "all") -> None:
-    """Update a metric with those of the inputs, named as in :data:`NEEDS`, that its :meth:`update` takes.
-
-    Args:
-        metric: the metric.
-        inputs: by name; with a ``moment``, ``speaking`` among them, a mask (frames,) for each sequence.
-        moment: in which frames it is taken; sequences without such a frame are left out.
-    """
-    taken = inspect.signature(type(metric).update).parameters
+    """Update a metric with the inputs that its :meth:`update` takes."""
+    parameters = inspect.signature(type(metric).update).parameters
     count = None
     if moment != "all":
         count = len(inputs["speaking"])
         inputs = split_frames(dict(inputs), inputs["speaking"], moment)
-    kept = inputs.get("kept", [0])
-    if kept:
-        metric.update(**{name: value for name, value in inputs.items() if name in taken})
-    if count is not None and isinstance(metric, SequenceMetric) and (not kept or metric.latest is not None):
+    frames = inputs.get("kept", [0])
+    if frames:
+        metric.update(**{name: value for name, value in inputs.items() if name in parameters})
+    if count is not None and isinstance(metric, SequenceMetric) and (not frames or metric.latest is not None):
         values = torch.full((count,), torch.nan, dtype=torch.float64)
-        if kept and metric.latest is not None:
-            values[kept] = metric.latest.cpu()
+        if frames and metric.latest is not None:
+            values[frames] = metric.latest.cpu()
         metric.latest = values
 
 

@@ -43,7 +43,7 @@ class ChannelMetric(SequenceMetric):
     of_channels: ClassVar[bool] = True
     """Whether the metric reads channels where motion has a rig that decodes them."""
     option_needs: ClassVar[Mapping[str, str]] = {}
-    """What is needed in addition where an option is on."""
+    """Further needs where an option is on."""
     usual_channels: ClassVar[str] = "all"
     """The group of channels that is taken where a metric is chosen by name and no region."""
 
@@ -56,8 +56,8 @@ class ChannelMetric(SequenceMetric):
 
     def flat(self, motion: Tensor) -> Tensor:
         """The region of a motion (frames, channels, dims) as (frames, D), float64."""
-        chosen = motion if self.indices is None else motion.index_select(1, self.indices)
-        return chosen.flatten(1).double()
+        channels = motion if self.indices is None else motion.index_select(1, self.indices)
+        return channels.flatten(1).double()
 
 
 class OneSideMetric(ChannelMetric):
@@ -108,6 +108,9 @@ class ChannelVariance(OneSideMetric):
         return motion.var(0, correction=0).mean()
 
 
+channel_variance = functional(ChannelVariance)
+
+
 @metric.register("frame_pair_distance")
 class FramePairDistance(OneSideMetric):
     """Div: how different frames are, mean distance of random pairs of them; DualTalk's table.
@@ -149,6 +152,9 @@ class FramePairDistance(OneSideMetric):
         return (motion[first] - motion[second]).norm(dim=1).mean()
 
 
+frame_pair_distance = functional(FramePairDistance)
+
+
 @metric.register("channel_dynamics_deviation")
 class ChannelDynamicsDeviation(ChannelMetric):
     r"""PDD and JDD: by how much the spread of channels over time is off, 100 · mean_d \|std x_d − std y_d\|.
@@ -174,6 +180,9 @@ class ChannelDynamicsDeviation(ChannelMetric):
         return 100 * (spread - true_spread).abs().mean()
 
 
+channel_dynamics_deviation = functional(ChannelDynamicsDeviation)
+
+
 @metric.register("step_distance")
 class StepDistance(ChannelMetric):
     """STS: how different the steps from frame to frame are from the truth's, √(Σ (Δx − Δy)² / 0.1); DualTalk's table.
@@ -197,11 +206,14 @@ class StepDistance(ChannelMetric):
         return ((self.flat(clip.prediction) - self.flat(clip.truth)).diff(dim=0).square().sum() / 0.1).sqrt()
 
 
+step_distance = functional(StepDistance)
+
+
 @metric.register("lip_dynamics_deviation")
 class LipDynamicsDeviation(OpeningMetric):
     r"""LDD: by how much the spread of the mouth's opening over time is off, \|std o_p − std o_g\|.
 
-    The opening o is that of :class:`MouthOpeningDifference`, the standard deviation the population's. The code of
+    The opening o is as in :class:`MouthOpeningDifference`, the standard deviation the population's. The code of
     ARTalk and UniLS has it commented out; mean over sequences.
 
     Args:
@@ -232,17 +244,14 @@ class LipDynamicsDeviation(OpeningMetric):
         return self.scale * (predicted.std(correction=0) - true.std(correction=0)).abs()
 
 
-# Conversations: the motion of whom the person talks with is read too.
+lip_dynamics_deviation = functional(LipDynamicsDeviation)
+
+
+# Conversations: the motion of the partner is read too.
 
 
 def attach_partners(clips: Clips, partner: Tensor | None, *, single: bool) -> Clips:
-    """The sequences with their partners' motion, cut to the frames that are scored.
-
-    Args:
-        clips: the sequences.
-        partner: (batch, frames, channels, dims); without the batch axis if ``single``.
-        single: whether there is one sequence without batch axis.
-    """
+    """The sequences with their partners' motion, cut to the frames that are scored."""
     motions = clips.rows("partner", partner, single=single, ndim=4)
     for clip, motion in zip(clips.clips, motions, strict=True):
         if len(motion) < clip.frames or motion.shape[1:] != clip.truth.shape[1:]:
@@ -259,8 +268,8 @@ class ResidualPartnerCorrelation(ChannelMetric):
     r"""rPCC: how far the correlation with the partner's motion is from the truth's, \|r(y, q) − r(x, q)\|; DualTalk.
 
     r is Pearson's correlation of all frames and channels of one sequence, flattened, q the partner's motion; the mean
-    over sequences is a choice. A prediction that does not vary has r = 0; a sequence whose partner does not vary is
-    left out.
+    over sequences is a choice. A prediction that does not vary has r = 0; a sequence is left out where the partner does
+    not move.
     """
 
     higher_is_better = False
@@ -283,14 +292,11 @@ class ResidualPartnerCorrelation(ChannelMetric):
     def update(
         self, prediction: Tensor, truth: Tensor, *, partner: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
-        """Add a batch of sequences.
-
-        Args:
-            prediction: (batch, frames, channels, 1) or one sequence (frames, channels, 1), floating point.
-            truth: of the same shape as the prediction.
-            partner: motion of whom the person talks with, of the truth's shape.
-        """
+        """Add a batch of sequences (batch, frames, channels, 1); ``partner`` is the other person's motion, as large."""
         self.add(attach_partners(self.align(prediction, truth, **batch), partner, single=truth.ndim == 3))
+
+
+residual_partner_correlation = functional(ResidualPartnerCorrelation)
 
 
 # Distances of distributions over all frames of all sequences.
@@ -319,7 +325,7 @@ class DistributionMetric(ChannelMetric):
             if clip.partner is not None:
                 sides = [torch.cat([self.flat(clip.partner), side], 1) for side in sides]
             self.add_frames(*sides)
-        # The score is no mean of the sequences' values; whoever combines sequences must add up states instead.
+        # The score is no mean of the sequences' values; combining sequences means adding up states.
         self.latest = None
 
 
@@ -332,7 +338,7 @@ class FrechetDistance(DistributionMetric):
     P-FD: a frame is the partner's followed by the person's own. Blind to time: motion in any order has the same score.
 
     Args:
-        region: channels, a :class:`Region` or indices; the covariance is a state, whose size must be known.
+        region: channels, a :class:`Region` or indices; the covariance is a state of known size.
         with_partner: look at both people of a conversation.
         dims: numbers of each point: 1 of channels, 3 of vertices.
 
@@ -359,8 +365,8 @@ class FrechetDistance(DistributionMetric):
     ) -> None:
         if region is None:
             raise ValueError("the Fréchet distance needs its channels; give a region, such as region=expression")
-        whose = "the partner's frame followed by the person's own" if with_partner else "frames"
-        definition = f"Fréchet distance between Gaussians of {whose}, over {{region}}, all sequences together [unit²]"
+        frame = "the partner's frame followed by the person's own" if with_partner else "frames"
+        definition = f"Fréchet distance between Gaussians of {frame}, over {{region}}, all sequences together [unit²]"
         super().__init__(region, definition=definition, **options)
         self.with_partner = with_partner
         self.dims = dims
@@ -370,19 +376,16 @@ class FrechetDistance(DistributionMetric):
 
     def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
         """Add to the sums and to the sums of products."""
-        both = torch.stack([prediction, truth])
-        self.sums = self.sums + both.sum(1)
-        self.products = self.products + both.mT @ both
+        sides = torch.stack([prediction, truth])
+        self.sums = self.sums + sides.sum(1)
+        self.products = self.products + sides.mT @ sides
 
     def update(
         self, prediction: Tensor, truth: Tensor, *, partner: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
-        """Add a batch of sequences.
+        """Add a batch of sequences (batch, frames, channels, 1).
 
-        Args:
-            prediction: (batch, frames, channels, 1) or one sequence (frames, channels, 1), floating point.
-            truth: of the same shape as the prediction.
-            partner: motion of whom the person talks with, of the truth's shape; for ``with_partner``.
+        With ``with_partner``, ``partner`` is the other person's motion, as large.
         """
         clips = self.align(prediction, truth, **batch)
         if clips.dims != self.dims:
@@ -412,29 +415,27 @@ class FrechetDistance(DistributionMetric):
         return distance.clamp_min(0)
 
 
+frechet_distance = functional(FrechetDistance)
+
+
 def cluster_centres(frames: Tensor, count: int, seed: int) -> Tensor:
-    """k-means: at most ``count`` centres (k, D) of frames (frames, D), whatever their order.
+    """k-means: at most ``count`` centres (k, D) of frames (frames, D), in any order.
 
     Our own, so that the metrics need no further library: k-means++ chooses the first centres with the seed, then
     Lloyd's two steps are repeated until no frame changes its centre, 300 times at most. Equal frames count as often as
     they occur; an empty cluster keeps its centre. There are fewer centres than asked for where there are fewer
     different frames.
-
-    Args:
-        frames: float64.
-        count: how many centres.
-        seed: of the first centres.
     """
     points, weights = torch.unique(frames.cpu(), dim=0, return_counts=True)
     weights = weights.double()
     random = torch.Generator().manual_seed(seed)
-    chosen = torch.multinomial(weights, 1, generator=random)
-    while len(chosen) < min(count, len(points)):
-        far = (points[:, None] - points[chosen]).square().sum(-1).amin(1) * weights
-        if not bool(far.any()):
+    seeds = torch.multinomial(weights, 1, generator=random)
+    while len(seeds) < min(count, len(points)):
+        distances = (points[:, None] - points[seeds]).square().sum(-1).amin(1) * weights
+        if not bool(distances.any()):
             break
-        chosen = torch.cat([chosen, torch.multinomial(far, 1, generator=random)])
-    centres = points[chosen]
+        seeds = torch.cat([seeds, torch.multinomial(distances, 1, generator=random)])
+    centres = points[seeds]
     labels = torch.full((len(points),), -1)
     for _ in range(300):
         nearest = nearest_centres(points, centres)
@@ -460,14 +461,14 @@ class ShannonIndex(DistributionMetric):
     k-means finds ``clusters`` centres of all the truth's frames, each predicted frame gets the label of the nearest,
     and the score is −Σ p log₂ p over the labels' shares p: 0 for a frozen face, log₂ k at most. Learning2Listen and
     DualTalk take k 40 for the expression, 10 for jaw and 10 for head, seed 0, and scikit-learn's k-means; ours is
-    :func:`cluster_centres`, whose centres are of the same kind and not the same. Compare with ``of="truth"``.
+    :func:`cluster_centres`, with other centres of the same kind. Compare with ``of="truth"``.
 
     **Memory grows with the number of frames**, which are kept in float64: 100 000 of 50 channels take 80 MB.
 
     Args:
         clusters: k.
         seed: of k-means.
-        of: ``"prediction"`` or ``"truth"``: whose labels are counted.
+        of: ``"prediction"`` or ``"truth"``, the side of the counted labels.
 
     >>> import torch
     >>> truth = torch.tensor([0.0, 1.0, 8.0, 9.0])[:, None, None]
@@ -540,6 +541,9 @@ class ShannonIndex(DistributionMetric):
         return -torch.special.xlogy(shares, shares).sum() / torch.log(torch.tensor(2.0, dtype=torch.float64)) + 0.0
 
 
+shannon_index = functional(ShannonIndex)
+
+
 # Speaking and listening: the same metric on some frames of each sequence.
 
 Moment = Literal["all", "speaking", "listening"]
@@ -550,13 +554,13 @@ def split_frames(inputs: dict[str, Any], speaking: Sequence[Tensor] | Tensor, mo
     """A batch's inputs with only those frames of each sequence in which the person speaks, or listens.
 
     Args:
-        inputs: ``prediction`` and ``truth`` (batch, frames, points, dims), with ``lengths``, and whatever else a metric
-            takes for each sequence; sequences that have no such frame are left out of all of them.
+        inputs: ``prediction`` and ``truth`` (batch, frames, points, dims), with ``lengths``, and other inputs of a
+            metric for each sequence; sequences that have no such frame are left out of all of them.
         speaking: for each sequence a mask (frames,), true where the person speaks.
         moment: ``"speaking"`` or ``"listening"``.
 
     Returns:
-        The inputs, and under ``kept`` the places of the sequences that are left.
+        The inputs, and under ``kept`` the numbers of the sequences that are left.
     """
     check_option("moment", moment, Literal["speaking", "listening"])
     prediction, truth = inputs["prediction"], inputs["truth"]
@@ -565,41 +569,31 @@ def split_frames(inputs: dict[str, Any], speaking: Sequence[Tensor] | Tensor, mo
     lengths = inputs.get("lengths")
     counts = [truth.shape[1]] * len(truth) if lengths is None else torch.as_tensor(lengths).reshape(-1).tolist()
     masks = []
-    for place, (mask, count) in enumerate(zip(speaking, counts, strict=True)):
+    for clip, (mask, count) in enumerate(zip(speaking, counts, strict=True)):
         if mask.dtype != torch.bool or mask.ndim != 1 or len(mask) < count:
             raise ValueError(
-                f"the mask of speaking frames of sequence {place} has type {mask.dtype} and shape {tuple(mask.shape)}; "
+                f"the mask of speaking frames of sequence {clip} has type {mask.dtype} and shape {tuple(mask.shape)}; "
                 f"expected {count} booleans"
             )
-        chosen = mask if moment == "speaking" else ~mask
+        frame_mask = mask if moment == "speaking" else ~mask
         # Predictions may be shorter than the truth; a metric's own rule no longer applies to frames that are picked.
-        masks.append(chosen[: min(count, prediction.shape[1])].to(truth.device))
-    kept = [place for place, mask in enumerate(masks) if bool(mask.any())]
-    width = max((int(masks[place].sum()) for place in kept), default=1)
+        masks.append(frame_mask[: min(count, prediction.shape[1])].to(truth.device))
+    numbers = [clip for clip, mask in enumerate(masks) if bool(mask.any())]
+    width = max((int(masks[clip].sum()) for clip in numbers), default=1)
 
     def picked(motion: Tensor) -> Tensor:
-        rows = motion.new_zeros(len(kept), width, *motion.shape[2:])
-        for row, place in zip(rows, kept, strict=True):
-            frames = motion[place, : len(masks[place])][masks[place]]
+        rows = motion.new_zeros(len(numbers), width, *motion.shape[2:])
+        for row, clip in zip(rows, numbers, strict=True):
+            frames = motion[clip, : len(masks[clip])][masks[clip]]
             row[: len(frames)] = frames
         return rows
 
-    result = {**inputs, "prediction": picked(prediction), "truth": picked(truth), "kept": kept}
-    result["lengths"] = [int(masks[place].sum()) for place in kept]
+    result = {**inputs, "prediction": picked(prediction), "truth": picked(truth), "kept": numbers}
+    result["lengths"] = [int(masks[clip].sum()) for clip in numbers]
     for name, value in inputs.items():
         per_sequence = name in ("template", "offsets_from") and isinstance(value, Tensor) and value.ndim == 3
         if per_sequence or name in ("clip_names", "identities"):
-            result[name] = value[kept] if isinstance(value, Tensor) else [value[place] for place in kept]
+            result[name] = value[numbers] if isinstance(value, Tensor) else [value[clip] for clip in numbers]
         elif name == "partner":
             result[name] = picked(value if value.ndim == 4 else value[None])
     return result
-
-
-channel_variance = functional(ChannelVariance)
-frame_pair_distance = functional(FramePairDistance)
-channel_dynamics_deviation = functional(ChannelDynamicsDeviation)
-step_distance = functional(StepDistance)
-lip_dynamics_deviation = functional(LipDynamicsDeviation)
-residual_partner_correlation = functional(ResidualPartnerCorrelation)
-frechet_distance = functional(FrechetDistance)
-shannon_index = functional(ShannonIndex)

@@ -1,6 +1,6 @@
 """Eyelids: how often they shut, a minute or as a share of the truth's, and whether they rest between blinks.
 
-The opening of the eyes is read off pairs of an upper and a lower eyelid vertex, as that of the mouth is off pairs of
+The opening of the eyes is read off pairs of an upper and a lower eyelid vertex, as the mouth's is off pairs of
 lip vertices. How far they are shut is a share of the sequence's own usual opening, so that heavy lids or a squint do
 not count as half a blink.
 """
@@ -99,7 +99,7 @@ class BlinkMetric(LidMetric):
 class BlinkRateRatio(BlinkMetric):
     """Blink rate ratio: blinks of the prediction over blinks of the truth, summed over all sequences.
 
-    1 is as often as the truth, 0 somebody who never blinks. It does not ask for blinks at the same moments: speech does
+    1 is as often as the truth, 0 a face that never blinks. It does not ask for blinks at the same moments: speech does
     not say when. Definition and limits are ours.
 
     >>> import torch
@@ -118,8 +118,11 @@ class BlinkRateRatio(BlinkMetric):
         return self.blinks(clip)
 
 
+blink_rate_ratio = functional(BlinkRateRatio)
+
+
 Blinker = Literal["prediction", "truth"]
-"""Whose blinks are counted."""
+"""The motion in which blinks are counted."""
 
 
 @metric.register("blink_rate")
@@ -165,6 +168,9 @@ class BlinkRate(BlinkMetric):
         return (predicted if self.of == "prediction" else true), minutes
 
 
+blink_rate = functional(BlinkRate)
+
+
 @metric.register("eyelid_drift")
 class EyelidDrift(LidMetric):
     """Eyelid drift: how far lids stray from their usual opening between blinks, as a share of how far the truth's do.
@@ -207,6 +213,4 @@ class EyelidDrift(LidMetric):
         return shut.abs().where(between, 0.0).sum() / between.sum().clamp_min(1)
 
 
-blink_rate = functional(BlinkRate)
-blink_rate_ratio = functional(BlinkRateRatio)
 eyelid_drift = functional(EyelidDrift)

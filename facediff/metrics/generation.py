@@ -1,7 +1,7 @@
 """Does a model generate? How lively motion is, whether samples scatter as much as they err, and a proper score of both.
 
 A model that predicts the mean of all that speech leaves open scores well in every distance from the truth, and moves
-the upper face hardly at all. These metrics see that. Those of
+the upper face hardly at all. These metrics see that. Metrics of
 calibration compare several samples of each sequence with the one recorded truth.
 """
 
@@ -60,7 +60,7 @@ class RatioMetric(Denominator):
 
     @abstractmethod
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
-        """Numerator and denominator of one sequence, float64 scalars, or those of several ratios."""
+        """Numerator and denominator of one sequence, float64 scalars, or of several ratios."""
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The ratio of one sequence; infinity where its denominator is zero."""
@@ -74,7 +74,7 @@ class RatioMetric(Denominator):
         super().add(clips)
         if self._latest_parts:
             self.parts = self.parts + torch.stack(self._latest_parts).sum(0)
-        # The score is no mean of the sequences' values; whoever combines sequences must add up states instead.
+        # The score is no mean of the sequences' values; to combine sequences, add up states.
         self.latest = None
 
     def finish(self, ratio: Tensor) -> Tensor:
@@ -120,6 +120,9 @@ class MotionLiveliness(RatioMetric):
         return ratio.sqrt()
 
 
+motion_liveliness = functional(MotionLiveliness)
+
+
 def _differences(motion: Tensor) -> Tensor:
     """Summed squares of the first and the second differences over time of one sequence, (2,)."""
     return torch.stack([torch.diff(motion, n, dim=0).square().sum() for n in (1, 2)])
@@ -154,9 +157,12 @@ class FrameStep(RatioMetric):
         return ratio.sqrt()
 
 
+frame_step = functional(FrameStep)
+
+
 @metric.register("difference_ratio")
 class DifferenceRatio(RatioMetric):
-    r"""Difference ratio: how much a region shivers, the size of its second over that of its first differences in time.
+    r"""Difference ratio: how much a region shivers, the size of its second differences in time over its first.
 
     √(Σ ‖x[t+1] − 2x[t] + x[t−1]‖² / Σ ‖x[t+1] − x[t]‖²), over frames, vertices and sequences: √3 for noise that is
     independent from frame to frame, near 0 for slow movement. 0.7 is usual for an upper face that blinks.
@@ -199,6 +205,9 @@ class DifferenceRatio(RatioMetric):
     def finish(self, ratio: Tensor) -> Tensor:
         """The product of both, from squares to lengths."""
         return ratio.prod().sqrt()
+
+
+difference_ratio = functional(DifferenceRatio)
 
 
 @metric.register("spectrum_distance")
@@ -244,8 +253,8 @@ class SpectrumDistance(Denominator):
         for side in (clip.prediction, clip.truth):
             motion = _of(side, self.indices).flatten(1)
             frames = len(motion)
-            place = torch.arange(frames, dtype=torch.float64, device=motion.device)
-            window = torch.sin(torch.pi * (place + 0.5) / frames)
+            time = torch.arange(frames, dtype=torch.float64, device=motion.device)
+            window = torch.sin(torch.pi * (time + 0.5) / frames)
             transformed = torch.fft.fft((motion - motion.mean(0)) * window[:, None], dim=0)
             power = transformed.abs().square().sum(1) / window.square().sum()
             # Frequencies as shares of Nyquist's; the octave k holds those in (2^-(k+1), 2^-k].
@@ -267,7 +276,7 @@ class SpectrumDistance(Denominator):
         super().add(clips)
         if self._latest_powers:
             self.powers = self.powers + torch.stack(self._latest_powers).sum(0)
-        # The score is no mean of the sequences' values; whoever combines sequences must add up states instead.
+        # The score is no mean of the sequences' values; to combine sequences, add up states.
         self.latest = None
 
     def compute(self) -> Tensor:
@@ -276,6 +285,9 @@ class SpectrumDistance(Denominator):
             self.refuse_to_compute(0)
         self.check_denominator(self.powers[1].sum())
         return _decibels(self.powers)
+
+
+spectrum_distance = functional(SpectrumDistance)
 
 
 def _decibels(powers: Tensor) -> Tensor:
@@ -326,22 +338,25 @@ class SpreadErrorRatio(OfSamples, RatioMetric):
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Distances between samples, and between samples and truth, summed over frames."""
-        several, error = clip.prediction, ErrorOf(self.indices, "mean", squared=self.squared)
+        samples, error = clip.prediction, ErrorOf(self.indices, "mean", squared=self.squared)
 
-        def apart(one: Tensor, other: Tensor) -> Tensor:
-            return one_pass(one, other, errors=[error])[0][0] * clip.frames
+        def apart(first: Tensor, second: Tensor) -> Tensor:
+            return one_pass(first, second, errors=[error])[0][0] * clip.frames
 
-        between = [apart(several[:, i], several[:, j]) for i, j in combinations(range(several.shape[1]), 2)]
+        between = [apart(samples[:, i], samples[:, j]) for i, j in combinations(range(samples.shape[1]), 2)]
         if self.squared:
             # Half of the mean squared distance of two samples is their variance, without bias.
-            share = (1 + 1 / several.shape[1]) / 2
-            return share * torch.stack(between).mean(), apart(several.mean(1), clip.truth)
-        off = [apart(sample, clip.truth) for sample in several.unbind(1)]
+            share = (1 + 1 / samples.shape[1]) / 2
+            return share * torch.stack(between).mean(), apart(samples.mean(1), clip.truth)
+        off = [apart(sample, clip.truth) for sample in samples.unbind(1)]
         return torch.stack(between).mean(), torch.stack(off).mean()
 
 
+spread_error_ratio = functional(SpreadErrorRatio)
+
+
 Unit = Literal["frames", "sequences"]
-"""What the energy score takes as one vector: all coordinates of a frame, or of a whole sequence."""
+"""The vector of an energy score: all coordinates of a frame, or of a whole sequence."""
 
 
 @metric.register("energy_score")
@@ -351,8 +366,8 @@ class EnergyScore(OfSamples):
     ES = mean_i ‖x_i − y‖ − ½ mean_{i≠j} ‖x_i − x_j‖, the multivariate form of the continuous ranked probability score
     (Gneiting and Raftery 2007, eq. 22), unbiased in the number of samples. Vectors are all coordinates of a region in
     one frame, divided by the square root of the number of vertices so that regions compare; or with ``of="sequences"``
-    those of all frames, which also sees whether samples move as the truth does over time. In the vertices' unit; lower
-    is better. With a single sample of a deterministic model it is the distance itself.
+    the coordinates of all frames, which also sees whether samples move as the truth does over time. In the vertices'
+    unit; lower is better. With a single sample of a deterministic model it is the distance itself.
 
     Args:
         n_samples: how many samples there are of each sequence; other numbers are refused.
@@ -384,29 +399,25 @@ class EnergyScore(OfSamples):
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The score of one sequence, mean over its frames."""
-        several, truth = _of(clip.prediction, self.indices), _of(clip.truth, self.indices)
-        count = several.shape[1]
+        samples, truth = _of(clip.prediction, self.indices), _of(clip.truth, self.indices)
+        count = samples.shape[1]
 
-        def distance(one: Tensor, other: Tensor) -> Tensor:
-            squared = (one - other).square().sum((-2, -1)) / one.shape[-2]
+        def distance(first: Tensor, second: Tensor) -> Tensor:
+            squared = (first - second).square().sum((-2, -1)) / first.shape[-2]
             return squared.sqrt().mean() if self.of == "frames" else squared.mean().sqrt()
 
-        off = torch.stack([distance(sample, truth) for sample in several.unbind(1)]).mean()
-        between = [distance(several[:, i], several[:, j]) for i, j in combinations(range(count), 2)]
+        off = torch.stack([distance(sample, truth) for sample in samples.unbind(1)]).mean()
+        between = [distance(samples[:, i], samples[:, j]) for i, j in combinations(range(count), 2)]
         return off - 0.5 * torch.stack(between).mean()
+
+
+energy_score = functional(EnergyScore)
 
 
 def _of(motion: Tensor, indices: Tensor | None) -> Tensor:
     """A region of motion (frames, …, vertices, 3) in float64, in memory of its own."""
     return motion.to(torch.float64, copy=True) if indices is None else motion.index_select(-2, indices).double()
 
-
-motion_liveliness = functional(MotionLiveliness)
-spread_error_ratio = functional(SpreadErrorRatio)
-energy_score = functional(EnergyScore)
-spectrum_distance = functional(SpectrumDistance)
-frame_step = functional(FrameStep)
-difference_ratio = functional(DifferenceRatio)
 
 SMOOTHNESS: Mapping[str, tuple[Callable[[RegionLike], RatioMetric], str]] = {
     f"{name}_{region}": (implementation, region)

@@ -49,7 +49,7 @@ def opening(motion: Tensor, offsets_from: Tensor | None, pairs: Tensor) -> Tenso
 def speed(motion: Tensor, indices: Tensor) -> Tensor:
     """How far the vertices move from each frame to the next: m[t] = mean_v ‖x[t, v] − x[t − 1, v]‖₂, (frames − 1,).
 
-    ``motion`` is (frames, vertices, 3), where a template would cancel; ``indices`` are those of a region.
+    ``motion`` is (frames, vertices, 3), where a template would cancel; ``indices`` belong to a region.
     """
     frames = len(motion)
     out = torch.zeros(frames - 1, dtype=torch.float64, device=motion.device)
@@ -60,18 +60,18 @@ def speed(motion: Tensor, indices: Tensor) -> Tensor:
     return out
 
 
-def correlation(reference: Tensor, other: Tensor) -> Tensor:
+def correlation(reference: Tensor, values: Tensor) -> Tensor:
     """Pearson's correlation coefficient of two series of equal length.
 
-    0 where ``other`` does not vary, NaN where ``reference``, which it should follow, does not. A series varies if its
+    0 where ``values`` does not vary, NaN where ``reference``, which it should follow, does not. A series varies if its
     range exceeds 1e-12 of its largest absolute value, which rounding alone does not reach.
     """
     if len(reference) < 2:
         return torch.full((), torch.nan, dtype=torch.float64, device=reference.device)
-    first, second = reference - reference.mean(), other - other.mean()
+    first, second = reference - reference.mean(), values - values.mean()
     scale = (first.square().sum() * second.square().sum()).sqrt()
     coefficient = ((first * second).sum() / scale).clamp(-1, 1)
-    return torch.where(_steady(reference), torch.nan, torch.where(_steady(other), 0.0, coefficient))
+    return torch.where(_steady(reference), torch.nan, torch.where(_steady(values), 0.0, coefficient))
 
 
 def _steady(series: Tensor) -> Tensor:
@@ -100,12 +100,12 @@ class OpeningMetric(SequenceMetric):
         pooling: Pooling = "sequences",
         **options: Unpack[SequenceOptions],
     ) -> None:
-        named = as_lip_pairs(pairs)
-        definition = (definition or self.words).replace("{pairs}", str(named))
+        lip_pairs = as_lip_pairs(pairs)
+        definition = (definition or self.words).replace("{pairs}", str(lip_pairs))
         super().__init__(definition=definition, pooling=pooling, **options)
-        self.pairs = named
+        self.pairs = lip_pairs
         self.pair_indices: Tensor
-        self.register_buffer("pair_indices", named.tensor(), persistent=False)
+        self.register_buffer("pair_indices", lip_pairs.tensor(), persistent=False)
 
     @property
     def over(self) -> LipPairs:
@@ -122,14 +122,11 @@ class OpeningMetric(SequenceMetric):
     def update(
         self, prediction: Tensor, truth: Tensor, *, offsets_from: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
-        """Add a batch of sequences.
+        """Add a batch of sequences; see :meth:`SequenceMetric.update`.
 
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: of the same shape as the prediction.
-            offsets_from: neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, that
-                prediction and truth are offsets from. **None means that they are absolute vertices**; offsets
-                without it give another, meaningless number.
+        Prediction and truth are offsets from the neutral vertices ``offsets_from``, (batch, vertices, 3) or (vertices,
+        3) for all sequences. **None means that they are absolute vertices**; offsets without it give a meaningless
+        number.
         """
         self.add(self.align(prediction, truth, **batch).attach_templates(offsets_from, "offsets_from"))
 
@@ -169,12 +166,15 @@ class MouthOpeningDifference(OpeningMetric):
         return (predicted - true).abs().mean()
 
 
+mouth_opening_difference = functional(MouthOpeningDifference)
+
+
 _RULE = "a prediction that does not vary counts 0, a sequence whose truth does not vary is left out"
 
 
 @metric.register("lip_opening_correlation")
 class LipOpeningCorrelation(OpeningMetric):
-    """Lip PCC of the opening: does the mouth open when the truth's does, whatever the amount?
+    """Lip PCC of the opening: does the mouth open when the truth's does, by any amount?
 
     Per sequence Pearson's correlation over frames between o_g and o_p, the openings of the mouth (see
     :class:`MouthOpeningDifference`); then the mean over sequences. From −1 to 1, without unit; blind to the
@@ -205,6 +205,9 @@ class LipOpeningCorrelation(OpeningMetric):
         return correlation(true, predicted)
 
 
+lip_opening_correlation = functional(LipOpeningCorrelation)
+
+
 @metric.register("lip_speed_correlation")
 class LipSpeedCorrelation(LipMetric):
     """Lip PCC of the speed: do the lips move fast when the truth's do?
@@ -228,6 +231,9 @@ class LipSpeedCorrelation(LipMetric):
         return correlation(speed(clip.truth, self.indices), speed(clip.prediction, self.indices))
 
 
+lip_speed_correlation = functional(LipSpeedCorrelation)
+
+
 # Whether the mouth closes where speech has it closed.
 
 Interval = tuple[int, int]
@@ -236,7 +242,7 @@ Closures = Tensor | Sequence[Sequence[Interval]] | Sequence[Interval]
 after the last). For one sequence without batch axis a mask (frames,) or its list of intervals."""
 
 Counted = Literal["frames", "closures"]
-"""What a closure rate is a share of."""
+"""The unit that a closure rate counts."""
 
 COUNTED_WORDS: dict[Counted, str] = {
     "frames": "the frames of known closures in which the mouth is closed",
@@ -258,8 +264,8 @@ class BilabialClosureRate(OpeningMetric):
     Definition and default threshold are choices; there is no usual formula. Captured truth may miss
     closures too: give ``of="truth"`` next to the prediction's rate, or ``of="gap"``. From 0 to 1, a gap from −1 to 1.
 
-    A clip without a closure in its scored frames is left out; :meth:`coverage` counts, as ``frames``, what the rate
-    is a share of.
+    A clip without a closure in its scored frames is left out; :meth:`coverage` counts its closures or
+    frames as ``frames``.
 
     Args:
         threshold: share of the truth's range up to which a mouth counts as closed, 0 to 1.
@@ -322,7 +328,7 @@ class BilabialClosureRate(OpeningMetric):
         return rates["prediction"] - rates["truth"] if self.of == "gap" else rates[self.of]
 
     def clip_weight(self, clip: Clip) -> int:
-        """Frames in closures, or closures, whichever are counted."""
+        """Frames in closures or closures, by the unit."""
         return len(clip.closures) if self.count == "closures" else sum(end - start for start, end in clip.closures)
 
     def update(  # type: ignore[override]  # closures must be given
@@ -334,19 +340,17 @@ class BilabialClosureRate(OpeningMetric):
         offsets_from: Tensor | None = None,
         **batch: Unpack[UpdateOptions],
     ) -> None:
-        """Add a batch of sequences.
+        """Add a batch of sequences; see :meth:`OpeningMetric.update`.
 
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: of the same shape as the prediction.
-            closures: frames of the truth in which the mouth is known to close: a boolean mask (batch, frames),
-                a run of true frames being one closure, or for each sequence a list of intervals (first frame,
-                frame after the last) in order and without overlap. Frames that are not scored do not count.
-            offsets_from: neutral vertices that prediction and truth are offsets from; **None means that they
-                are absolute vertices**.
+        ``closures`` are the frames of the truth in which the mouth is known to close: a boolean mask (batch, frames), a
+        run of true frames being one closure, or for each sequence a list of intervals (first frame, frame after the
+        last) in order and without overlap. Frames that are not scored do not count.
         """
         clips = self.align(prediction, truth, **batch).attach_templates(offsets_from, "offsets_from")
         self.add(_attach_closures(clips, closures, padded=truth.shape[-3], single=truth.ndim == 3))
+
+
+bilabial_closure_rate = functional(BilabialClosureRate, positional=["closures"])
 
 
 def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: bool) -> Clips:
@@ -377,11 +381,5 @@ def _attach_closures(clips: Clips, closures: Closures, *, padded: int, single: b
 def _runs(row: Sequence[bool]) -> list[Interval]:
     """Runs of true values as intervals."""
     framed = [False, *row, False]
-    edges = [place for place in range(len(row) + 1) if framed[place] != framed[place + 1]]
+    edges = [frame for frame in range(len(row) + 1) if framed[frame] != framed[frame + 1]]
     return list(zip(edges[::2], edges[1::2], strict=True))
-
-
-mouth_opening_difference = functional(MouthOpeningDifference)
-lip_opening_correlation = functional(LipOpeningCorrelation)
-lip_speed_correlation = functional(LipSpeedCorrelation)
-bilabial_closure_rate = functional(BilabialClosureRate, positional=["closures"])

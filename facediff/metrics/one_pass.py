@@ -46,7 +46,7 @@ def one_pass(
 
     For each of ``errors`` its mean over frames, and for each of ``uppers``, (region,) int64, the signed deviation; for
     these a ``template`` (points, dims) is given unless prediction and truth (frames, points, dims) are offsets from it.
-    What is found does not depend on what else is asked for: each vertex goes through the same float64 operations.
+    Each result is the same alone and beside others: each vertex goes through the same float64 operations.
     """
     frames, vertices, _ = truth.shape
     regions = [*(error.indices for error in errors), *uppers]
@@ -61,9 +61,9 @@ def one_pass(
     ]
     for start in range(0, frames, step):
         true, predicted = truth[start : start + step], prediction[start : start + step]
-        whole = squared_errors(true, predicted, buffers) if everywhere else None
-        for place, error in enumerate(errors):
-            totals[place] += _sum_over_frames(error, whole, true, predicted, buffers)
+        all_squares = squared_errors(true, predicted, buffers) if everywhere else None
+        for row, error in enumerate(errors):
+            totals[row] += _sum_over_frames(error, all_squares, true, predicted, buffers)
         for of_truth, of_prediction in deviations:
             of_truth.add(true)
             of_prediction.add(predicted)
@@ -86,10 +86,10 @@ class Buffers:
     def get(self, name: str, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
         """Memory of that shape, with anything in it; the same for the same name and type."""
         size = math.prod(shape)
-        kept = self.kept.get((name, dtype))
-        if kept is None or len(kept) < size:
-            kept = self.kept[name, dtype] = torch.empty(size, dtype=dtype, device=self.device)
-        return kept[:size].view(shape)
+        buffer = self.kept.get((name, dtype))
+        if buffer is None or len(buffer) < size:
+            buffer = self.kept[name, dtype] = torch.empty(size, dtype=dtype, device=self.device)
+        return buffer[:size].view(shape)
 
 
 def widened(motion: Tensor, name: str, buffers: Buffers) -> Tensor:
@@ -115,13 +115,15 @@ def squared_errors(true: Tensor, predicted: Tensor, buffers: Buffers) -> Tensor:
     return errors
 
 
-def _sum_over_frames(error: ErrorOf, whole: Tensor | None, true: Tensor, predicted: Tensor, buffers: Buffers) -> Tensor:
+def _sum_over_frames(
+    error: ErrorOf, all_squares: Tensor | None, true: Tensor, predicted: Tensor, buffers: Buffers
+) -> Tensor:
     """The error of each frame, added up; from the squared errors of all vertices if there are any."""
-    if whole is None:
+    if all_squares is None:
         region = cast(Tensor, error.indices)
         squares = squared_errors(true.index_select(1, region), predicted.index_select(1, region), buffers)
     else:
-        squares = whole if error.indices is None else whole.index_select(1, error.indices)
+        squares = all_squares if error.indices is None else all_squares.index_select(1, error.indices)
     if error.reduction == "max":
         largest = squares.amax(1)  # before the root: the root is monotone, and taken once a frame
         return (largest if error.squared else largest.sqrt()).sum()
@@ -167,9 +169,9 @@ class Variation:
 
     def _squared_offsets(self, motion: Tensor) -> Tensor:
         """(frames, region), in a buffer."""
-        chosen = self.buffers.get("chosen", len(motion), self.dims * self.count, dtype=motion.dtype)
-        torch.index_select(motion.reshape(len(motion), -1), 1, self.places, out=chosen)
-        offset = widened(chosen, "offset", self.buffers)
+        offsets = self.buffers.get("chosen", len(motion), self.dims * self.count, dtype=motion.dtype)
+        torch.index_select(motion.reshape(len(motion), -1), 1, self.places, out=offsets)
+        offset = widened(offsets, "offset", self.buffers)
         if self.still is not None:
             offset.sub_(self.still)
         first, *rest = offset.view(len(motion), self.dims, self.count).unbind(1)

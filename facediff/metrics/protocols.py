@@ -39,7 +39,7 @@ class Protocol:
     """A named setting of the metrics' options.
 
     Args:
-        name: what to print next to the numbers.
+        name: printed next to the numbers.
         source: where the setting comes from.
         mve: reduction over vertices of the mean vertex error; None omits the metric.
         mve_squared: whether its distances are squared.
@@ -52,7 +52,7 @@ class Protocol:
         length_rule: what to do where prediction and truth differ in length.
         channels: whether these are taken of channels, the formulas of vertices with channels for vertices; else of
             vertices, which motion in parameters is decoded to, with the head at rest.
-        unit: unit of lengths in which vertices are scored; None for that of the motion.
+        unit: unit of lengths in which vertices are scored; the motion's own if None.
         metrics: further scores, each its name and the metric by name with options.
         topology: name of the mesh, one of :data:`TOPOLOGIES`. Then regions and motion of another mesh are refused,
             and the summary says whether the regions are those in use on it. None for any mesh.
@@ -89,11 +89,7 @@ class Protocol:
         return not self.channels or any(not request.of_channels for request in self.further().values())
 
     def further(self, scale: float = 1.0) -> dict[str, Request]:
-        """The further scores by name, as requests.
-
-        Args:
-            scale: factor of lengths, for metrics that take one.
-        """
+        """The further scores by name, as requests."""
         return {name: parse(text).scaled(scale) for name, text in self.metrics}
 
     def describe(self) -> str:
@@ -119,7 +115,7 @@ class Protocol:
 
     def deviations(self) -> dict[str, Sign]:
         """Sign of each face dynamics deviation by its name."""
-        return {f"fdd_{sign}" if place else "fdd": sign for place, sign in enumerate(self.fdd)}
+        return {f"fdd_{sign}" if number else "fdd": sign for number, sign in enumerate(self.fdd)}
 
     def build(self, lips: RegionLike, upper: RegionLike | None = None, *, scale: float = 1.0) -> ProtocolMetrics:
         """The metrics of this protocol for a topology, without the further ones, which :meth:`further` gives.
@@ -238,7 +234,7 @@ def protocol(name: str = "paper", *, topology: str | None = None) -> Protocol:
 
 @dataclass(frozen=True)
 class Summary:
-    """What to print next to the scores; ``upper`` is None if the protocol does not use the upper face."""
+    """The line next to the scores; ``upper`` is None if the protocol does not use the upper face."""
 
     protocol: str
     lips: Region
@@ -248,7 +244,7 @@ class Summary:
 
     @property
     def remarks(self) -> list[str]:
-        """Whether each region is one in use on the topology; empty where that is not known."""
+        """Whether each region is one in use on the topology; empty where none is given."""
         if self.topology is None:
             return []
         mesh, upper = TOPOLOGIES[self.topology], self.upper
@@ -314,15 +310,7 @@ class ProtocolMetrics(MetricCollection):
     def update(  # type: ignore[override]  # it is ModuleDict.update that torchmetrics has redefined
         self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
-        """Add a batch of sequences to every metric.
-
-        Args:
-            prediction: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            truth: of the same shape as the prediction.
-            template: neutral vertices (batch, vertices, 3) or (vertices, 3) if the motion is absolute; None
-                if prediction and truth are offsets from the template already.
-            **batch: ``lengths``, ``prediction_lengths`` and ``clip_names`` as for :meth:`SequenceMetric.update`.
-        """
+        """Add a batch of sequences to every metric; see :meth:`FaceDynamicsDeviation.update`."""
         self._check(prediction, truth, template, batch)
         super().update(prediction, truth, template=template, **batch)
 

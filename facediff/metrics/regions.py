@@ -12,6 +12,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, SupportsIndex
@@ -21,10 +23,10 @@ from torch import Tensor
 
 
 class Vertices(ABC):
-    """Named vertices of a mesh, or pairs of them: what regions and pairs have in common.
+    """Named vertices of a mesh, or pairs of them: the base of regions and pairs.
 
     Attributes:
-        name: what they are called next to a score.
+        name: printed next to a score.
         duplicates: how many repeated entries the source held.
     """
 
@@ -42,19 +44,24 @@ class Vertices(ABC):
         return f"{self.name} ({self.count} {self.entries_in_words}, {self.hash})"
 
     @property
-    @abstractmethod
-    def bounds(self) -> tuple[int, int]:
-        """The smallest and the largest index."""
-
-    @property
     def count(self) -> int:
         """How many distinct entries there are."""
         return len(self.entries)
 
     @property
-    @abstractmethod
     def hash(self) -> str:
-        """First 8 hexadecimal digits of the SHA-256 of the entries."""
+        """First 8 hexadecimal digits of the SHA-256 of the entries.
+
+        The sorted distinct indices are written in decimal and joined by one comma without spaces, in ASCII, so the hash
+        can be recomputed anywhere: ``printf 1,2,3 | sha256sum | cut -c -8``. A pair is written like ``3504-3531`` with
+        the smaller index first. The name does not enter.
+
+        >>> Region.from_indices("lips", [3, 1, 2, 1]).hash
+        '8a6ae151'
+        """
+        rows = (entry if isinstance(entry, tuple) else (entry,) for entry in self.entries)
+        text = ",".join("-".join(map(str, row)) for row in rows)
+        return hashlib.sha256(text.encode("ascii")).hexdigest()[:8]
 
     def tensor(self) -> Tensor:
         """The entries as an int64 tensor of shape (count,), or (count, 2)."""
@@ -66,16 +73,18 @@ class Vertices(ABC):
 
     def check(self, n_vertices: int) -> None:
         """Refuse a mesh that they cannot belong to."""
-        lowest, highest = self.bounds
+        lowest, highest = self._bounds
         if lowest < 0 or highest >= n_vertices:
             raise ValueError(
                 f"{self} hold the index {lowest if lowest < 0 else highest}, a mesh of {n_vertices} vertices ends at "
                 f"{n_vertices - 1}; use the vertices of the motion's own topology"
             )
 
-
-def _short_hash(parts: Iterable[str]) -> str:
-    return hashlib.sha256(",".join(parts).encode("ascii")).hexdigest()[:8]
+    @cached_property
+    def _bounds(self) -> tuple[int, int]:
+        """The smallest and the largest index."""
+        indices = self.tensor()
+        return int(indices.min()), int(indices.max())
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,7 @@ class Region(Vertices):
     ``first | second`` is the union of two regions.
 
     Args:
-        name: what the region is called next to a score, for example ``"biwi/lve"``.
+        name: printed next to a score, for example ``"biwi/lve"``.
         indices: vertex indices from 0, strictly increasing.
         n_vertices: vertices of the mesh that the region belongs to, if known; it is then refused on others.
         duplicates: how many repeated indices the source held.
@@ -109,38 +118,17 @@ class Region(Vertices):
         if self.n_vertices is not None:
             super().check(self.n_vertices)
 
-    def __str__(self) -> str:
-        """Name, vertex count and hash, as printed next to a score."""
-        return super().__str__()
-
     @property
     def entries(self) -> tuple[int, ...]:
         """The indices."""
         return self.indices
 
-    @property
-    def bounds(self) -> tuple[int, int]:
-        """The first and the last index."""
-        return self.indices[0], self.indices[-1]
-
-    @property
-    def hash(self) -> str:
-        """First 8 hexadecimal digits of the SHA-256 of the sorted distinct indices.
-
-        The indices are written in decimal and joined by one comma without spaces, in ASCII, so the hash can
-        be recomputed anywhere: ``printf 1,2,3 | sha256sum | cut -c -8``. The name does not enter.
-
-        >>> Region.from_indices("lips", [3, 1, 2, 1]).hash
-        '8a6ae151'
-        """
-        return _short_hash(map(str, self.indices))
-
     def check(self, n_vertices: int) -> None:
         """Refuse a mesh that this region cannot belong to, or that is known to be another mesh."""
         if self.n_vertices is not None and n_vertices != self.n_vertices:
             raise ValueError(
-                f"region {self} belongs to a mesh of {self.n_vertices} vertices, the motion has "
-                f"{n_vertices}; use the region of the motion's own topology"
+                f"region {self} belongs to a mesh of {self.n_vertices} vertices, not of {n_vertices}; use the region "
+                f"of the motion's own topology"
             )
         super().check(n_vertices)
 
@@ -149,7 +137,7 @@ class Region(Vertices):
         """A region from indices in any order, repeated or not.
 
         Args:
-            name: what to call the region.
+            name: of the region.
             indices: integers, or a one-dimensional integer tensor or array. Masks of booleans are refused.
             n_vertices: vertices of the mesh, if known.
 
@@ -173,7 +161,7 @@ class Region(Vertices):
 
         Args:
             path: the file.
-            name: what to call the region; the file's name without its ending by default.
+            name: of the region; the file's name without its ending by default.
             n_vertices: vertices of the mesh, if known.
         """
         path = Path(path)
@@ -185,7 +173,7 @@ class Region(Vertices):
     def from_weights(
         cls, weights: Tensor | str | PathLike[str], threshold: float, *, name: str | None = None
     ) -> Region:
-        """The vertices whose weight is above a threshold, strictly.
+        """The vertices with a weight strictly above a threshold.
 
         Multiface's regions are such masks: FaceDiffuser's script takes the mouth where it is above 0.1 and
         the forehead where it is above 0.4.
@@ -194,7 +182,7 @@ class Region(Vertices):
             weights: one finite weight for each vertex of the mesh, (vertices,), or a text file of them, one per
                 line.
             threshold: vertices of exactly this weight do not belong to the region.
-            name: what to call the region; by default the file's name without its ending, or "weights", with
+            name: of the region; by default the file's name without its ending, or "weights", with
                 the threshold.
 
         >>> print(Region.from_weights(torch.tensor([0.0, 0.9, 0.1, 0.4]), 0.1))
@@ -206,34 +194,29 @@ class Region(Vertices):
             with errors_of(path, "one finite weight per line"):
                 values = torch.tensor(list(map(float, read_text(path).split())), dtype=torch.float64)
         name = name or f"{title} > {threshold:g}"
-        chosen = (values > threshold).nonzero().flatten()
-        if values.ndim != 1 or not bool(values.isfinite().all()) or not len(chosen):
+        indices = (values > threshold).nonzero().flatten()
+        if values.ndim != 1 or not bool(values.isfinite().all()) or not len(indices):
             raise ValueError(
                 f"region {name!r} needs finite weights, one for each vertex, some of them above {threshold:g}"
             )
-        return cls.from_indices(name, chosen, n_vertices=len(values))
+        return cls.from_indices(name, indices, n_vertices=len(values))
 
-    def union(self, *others: Region, name: str | None = None) -> Region:
+    def union(self, *regions: Region, name: str | None = None) -> Region:
         """The vertices of this region and others; vertices that they share count as duplicates.
-
-        Args:
-            *others: regions of the same mesh.
-            name: what to call the union; the names joined by " + " by default.
 
         >>> print(Region("forehead", (1, 2)).union(Region("eyes", (2, 3))))
         forehead + eyes (3 vertices, 8a6ae151)
         """
-        parts = (self, *others)
-        meshes = {part.n_vertices for part in parts} - {None}
-        if len(meshes) > 1:
-            listed = ", ".join(f"{part} of {part.n_vertices}" for part in parts)
-            raise ValueError(f"regions of different meshes cannot be united: {listed} vertices")
+        parts = (self, *regions)
+        sizes = [part.n_vertices for part in parts if part.n_vertices is not None]
+        for part, size in product(parts, sizes):
+            part.check(size)
         indices = (index for part in parts for index in part.indices)
         title = name or " + ".join(part.name for part in parts)
-        return Region.from_indices(title, indices, n_vertices=meshes.pop() if meshes else None)
+        return Region.from_indices(title, indices, n_vertices=sizes[0] if sizes else None)
 
-    def __or__(self, other: Region) -> Region:
-        return self.union(other)
+    def __or__(self, region: Region) -> Region:
+        return self.union(region)
 
 
 RegionLike = Region | Sequence[int] | Tensor
@@ -254,7 +237,7 @@ class LipPairs(Vertices):
     script of the MTM metric uses the one pair (3531, 3504) of FLAME, the middle of the outer lips.
 
     Args:
-        name: what the pairs are called next to a score, for example ``"flame/inner lips"``.
+        name: printed next to a score, for example ``"flame/inner lips"``.
         pairs: two different vertex indices each, the smaller first; the pairs strictly increasing.
         duplicates: how many repeated pairs the source held.
     """
@@ -275,43 +258,26 @@ class LipPairs(Vertices):
                 f"{type(self).__name__}.from_pairs"
             )
 
-    def __str__(self) -> str:
-        """Name, number of pairs and hash, as printed next to a score."""
-        return super().__str__()
-
     @property
     def entries(self) -> tuple[tuple[int, int], ...]:
         """The pairs."""
         return self.pairs
-
-    @property
-    def bounds(self) -> tuple[int, int]:
-        """The smallest and the largest index."""
-        return self.pairs[0][0], max(second for _, second in self.pairs)
-
-    @property
-    def hash(self) -> str:
-        """First 8 hexadecimal digits of the SHA-256 of the pairs.
-
-        Written like ``3504-3531`` with the smaller index first, sorted by number, joined by commas.
-        """
-        return _short_hash(f"{first}-{second}" for first, second in self.pairs)
 
     @classmethod
     def from_pairs(cls, name: str, pairs: Iterable[Iterable[int]] | Tensor) -> Self:
         """Pairs in any order, repeated or not, either vertex first.
 
         Args:
-            name: what to call them.
+            name: of the pairs.
             pairs: two integers each, or an integer tensor or array (pairs, 2).
 
         >>> print(LipPairs.from_pairs("middle", [(3531, 3504), (3504, 3531)]))
         middle (1 pairs, de4cd82d)
         """
         rows = getattr(pairs, "tolist", lambda: pairs)()  # of a tensor or an array
-        listed = [(operator.index(first), operator.index(second)) for first, second in rows]
-        distinct = sorted({(min(pair), max(pair)) for pair in listed})
-        return cls(name, tuple(distinct), duplicates=len(listed) - len(distinct))
+        indices = [(operator.index(first), operator.index(second)) for first, second in rows]
+        distinct = sorted({(min(pair), max(pair)) for pair in indices})
+        return cls(name, tuple(distinct), duplicates=len(indices) - len(distinct))
 
     @classmethod
     def from_file(cls, path: str | PathLike[str], *, name: str | None = None) -> Self:
@@ -319,7 +285,7 @@ class LipPairs(Vertices):
 
         Args:
             path: the file.
-            name: what to call them; the file's name without its ending by default.
+            name: of the pairs; the file's name without its ending by default.
         """
         path = Path(path)
         indices = read_indices(path)
@@ -350,7 +316,7 @@ def as_lip_pairs(pairs: LipPairsLike) -> LipPairs:
 
 @contextmanager
 def errors_of(path: Path, expected: str = "") -> Iterator[None]:
-    """Name the file, and what it should hold, in errors of reading it."""
+    """Name the file and its expected content in errors of reading it."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -379,7 +345,7 @@ Part = Literal["lips", "upper"]
 
 @dataclass(frozen=True)
 class Topology:
-    """The mesh of a data set, and what ``lips`` and ``upper`` face regions with so many distinct vertices are on it."""
+    """The mesh of a data set, and its usual ``lips`` and ``upper`` face regions by their number of vertices."""
 
     name: str
     n_vertices: int
@@ -392,17 +358,17 @@ class Topology:
         return replace(region, n_vertices=self.n_vertices)
 
     def remark(self, part: Part, region: Region) -> str:
-        """What is known of a region by its vertex count: whose it is, or that it is not a usual one.
+        """A remark on a region by its vertex count: the script that uses it, or that it is not a usual one.
 
         >>> TOPOLOGIES["biwi"].remark("lips", Region.from_indices("mine", [1, 2]))
         'lips of 2 vertices are not usual on biwi (4996: lve.txt of BIWI)'
         """
-        usual = self.lips if part == "lips" else self.upper
+        counts = self.lips if part == "lips" else self.upper
         verb = "are" if part == "lips" else "is"
-        if region.count in usual:
-            return f"{part} of {region.count} vertices {verb} usual on {self.name}: {usual[region.count]}"
-        known = "; ".join(f"{count}: {words}" for count, words in usual.items())
-        return f"{part} of {region.count} vertices {verb} not usual on {self.name} ({known})"
+        if region.count in counts:
+            return f"{part} of {region.count} vertices {verb} usual on {self.name}: {counts[region.count]}"
+        meanings = "; ".join(f"{count}: {meaning}" for count, meaning in counts.items())
+        return f"{part} of {region.count} vertices {verb} not usual on {self.name} ({meanings})"
 
 
 _FLAME_LIPS = {

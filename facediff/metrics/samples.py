@@ -27,7 +27,6 @@ from facediff.metrics.base import (
     align,
     check_option,
     check_range,
-    check_tensor,
     functional,
 )
 from facediff.metrics.one_pass import ErrorOf, one_pass
@@ -48,7 +47,6 @@ def align_samples(
     ``samples`` are (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3); without
     ``truth`` only their number of frames counts, and ``n_samples`` is None where there may be any number.
     """
-    check_tensor("samples", samples)
     if samples.ndim not in (4, 5) or samples.shape[-4] != (n_samples or samples.shape[-4] or 1):
         raise ValueError(
             f"samples have shape {tuple(samples.shape)}; expected (batch, samples, frames, vertices, 3) or (samples, "
@@ -59,7 +57,8 @@ def align_samples(
     clips = align(first, first if truth is None else truth, rule=rule, **batch)
     by_clip = [samples] if samples.ndim == 4 else list(samples)
     predictions = [
-        several.detach()[:, : clip.frames].transpose(0, 1) for clip, several in zip(clips.clips, by_clip, strict=True)
+        clip_samples.detach()[:, : clip.frames].transpose(0, 1)
+        for clip, clip_samples in zip(clips.clips, by_clip, strict=True)
     ]
     clips = clips.attach("prediction", predictions)
     return clips if truth is not None else clips.attach("truth", predictions)
@@ -68,7 +67,7 @@ def align_samples(
 SAMPLES_GIVEN: Inferred = {
     "n_samples": lambda arguments: arguments["samples"].shape[-4] if arguments["samples"].ndim > 3 else 2
 }
-"""How a function reads the number of samples from what it is given."""
+"""How a function reads the number of samples from its input."""
 
 
 class OfSamples(SequenceMetric):
@@ -76,7 +75,7 @@ class OfSamples(SequenceMetric):
 
     Args:
         n_samples: how many samples there are of each sequence; other numbers are refused.
-        **options: those of the next base class.
+        **options: of the next base class.
     """
 
     fewest: ClassVar[int] = 2
@@ -90,13 +89,9 @@ class OfSamples(SequenceMetric):
         self.n_samples = n_samples
 
     def update(self, samples: Tensor, truth: Tensor, **batch: Unpack[UpdateOptions]) -> None:
-        """Add a batch of sequences.
+        """Add a batch of sequences; ``prediction_lengths`` is the same for all samples of a sequence.
 
-        Args:
-            samples: predictions (batch, samples, frames, vertices, 3), or of one sequence (samples, frames,
-                vertices, 3), floating point.
-            truth: (batch, frames, vertices, 3) or (frames, vertices, 3), floating point.
-            **batch: those of :class:`UpdateOptions`; ``prediction_lengths`` is the same for all samples of a sequence.
+        ``samples`` are (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3).
         """
         self.add(align_samples(samples, truth, n_samples=self.n_samples, rule=self.length_rule, **batch))
 
@@ -157,6 +152,9 @@ class MeanEstimateError(SamplesMetric):
         return one_pass(lips / self.n_samples, truth, errors=[ErrorOf(None, "max", self.squared)])[0][0]
 
 
+mean_estimate_error = functional(MeanEstimateError)
+
+
 @metric.register("coverage_error")
 class CoverageError(SamplesMetric):
     """Coverage error (CE): the lip vertex error of the best of several samples of each sequence.
@@ -179,6 +177,9 @@ class CoverageError(SamplesMetric):
         lips = ErrorOf(self.indices, "max", self.squared)
         errors = [one_pass(sample, clip.truth, errors=[lips])[0][0] for sample in clip.prediction.unbind(1)]
         return torch.stack(errors).amin()
+
+
+coverage_error = functional(CoverageError)
 
 
 # How much predictions of one sequence differ.
@@ -214,13 +215,13 @@ class Diversity(SequenceMetric):
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The diversity of one sequence's predictions."""
-        several, error = clip.prediction, ErrorOf(self.indices, "mean", squared=False)
+        samples, error = clip.prediction, ErrorOf(self.indices, "mean", squared=False)
         distances = [
-            one_pass(several[:, one], several[:, other], errors=[error])[0][0]
-            for one, other in self.pairs(several.shape[1])
+            one_pass(samples[:, first], samples[:, second], errors=[error])[0][0]
+            for first, second in self.pairs(samples.shape[1])
         ]
         if not distances:
-            return torch.full((), torch.nan, dtype=torch.float64, device=several.device)
+            return torch.full((), torch.nan, dtype=torch.float64, device=samples.device)
         return torch.stack(distances).mean()
 
 
@@ -282,15 +283,11 @@ class SampleDiversity(Diversity):
     def update(  # type: ignore[override]  # there is no truth
         self, samples: Tensor, *, lengths: Lengths | None = None, clip_names: Sequence[str] | None = None
     ) -> None:
-        """Add a batch of sequences.
-
-        Args:
-            samples: (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3),
-                floating point.
-            lengths: valid frames of each sequence (batch,), or a mask (batch, frames).
-            clip_names: one name per sequence, for messages.
-        """
+        """Add samples (batch, samples, frames, vertices, 3), or of one sequence (samples, frames, vertices, 3)."""
         self.add(align_samples(samples, None, n_samples=self.n_samples, lengths=lengths, clip_names=clip_names))
+
+
+sample_diversity = functional(SampleDiversity)
 
 
 @metric.register("identity_diversity")
@@ -323,18 +320,8 @@ class IdentityDiversity(Diversity):
     def update(  # type: ignore[override]  # there is no truth
         self, predictions: Tensor, *, lengths: Lengths | None = None, clip_names: Sequence[str] | None = None
     ) -> None:
-        """Add a batch of sequences.
-
-        Args:
-            predictions: (batch, identities, frames, vertices, 3), or of one sequence (identities, frames,
-                vertices, 3), floating point.
-            lengths: valid frames of each sequence (batch,), or a mask (batch, frames).
-            clip_names: one name per sequence, for messages.
-        """
+        """Add predictions (batch, identities, frames, vertices, 3), or of one sequence without the batch axis."""
         self.add(align_samples(predictions, None, n_samples=None, lengths=lengths, clip_names=clip_names))
 
 
-mean_estimate_error = functional(MeanEstimateError)
-coverage_error = functional(CoverageError)
-sample_diversity = functional(SampleDiversity)
 identity_diversity = functional(IdentityDiversity)

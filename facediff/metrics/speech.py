@@ -1,7 +1,7 @@
 """Do the lips move much when the voice is loud? Correlation of the intensities of speech and lips (SLCC).
 
-The intensity of speech s[t] is the root mean square of the samples of frame t; that of the lips
-m[t] = mean_{v∈M} ‖x[t, v] − x[t − 1, v]‖₂ is their mean speed, t from the second frame on.
+The intensity of speech s[t] is the root mean square of the samples of frame t; the lips' intensity is
+their mean speed m[t] = mean_{v∈M} ‖x[t, v] − x[t − 1, v]‖₂, t from the second frame on.
 """
 
 from __future__ import annotations
@@ -38,12 +38,6 @@ def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per
 
     Frame t holds the samples from ⌊t · sample_rate / frames_per_second + ½⌋ up to where frame t + 1 begins.
 
-    Args:
-        waveform: (samples,), floating point; samples beyond the last frame are not read.
-        frames: how many frames.
-        sample_rate: samples per second.
-        frames_per_second: frames per second.
-
     Returns:
         (frames,), float64, in the waveform's unit.
 
@@ -68,10 +62,10 @@ class SpeechLipMetric(SequenceMetric):
 
     Args:
         lips: lip vertices, a :class:`Region` or indices.
-        of: whose lips: ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
+        of: the lips of the ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
         sample_rate: samples of the speech per second; needed for waveforms, not for intensities.
         frames_per_second: of the motion; needed with ``sample_rate``.
-        **options: those of :class:`SequenceOptions`; NaN and infinity in the speech are always refused.
+        **options: see :class:`SequenceOptions`; NaN and infinity in the speech are always refused.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lips", "speech")
@@ -105,14 +99,11 @@ class SpeechLipMetric(SequenceMetric):
         intensity: Tensor | None = None,
         **batch: Unpack[UpdateOptions],
     ) -> None:
-        """Add a batch of sequences with their speech.
+        """Add a batch of sequences with their speech; see :meth:`SequenceMetric.update`.
 
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: of the same shape as the prediction.
-            waveform: the sound (batch, samples), or (samples,) of one sequence, at the metric's
-                ``sample_rate``, beginning with the first frame. Samples beyond the scored frames are not read.
-            intensity: instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
+        ``waveform`` is the sound (batch, samples), or (samples,) of one sequence, at the metric's ``sample_rate``,
+        beginning with the first frame; samples beyond the scored frames are not read. ``intensity`` is given instead of
+        it: the intensity of each frame, (batch, frames) or (frames,).
         """
         clips = self.align(prediction, truth, **batch)
         self.add(self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3))
@@ -124,16 +115,18 @@ class SpeechLipMetric(SequenceMetric):
         if waveform is not None:
             rows = clips.rows("waveform", waveform, single=single, ndim=2)
             rate = float(self.frames_per_second or 0)
-            spoken = [
+            frame_counts = [
                 speech_intensity(row, clip.frames, int(self.sample_rate or 0), rate)
                 for clip, row in zip(clips.clips, rows, strict=True)
             ]
         else:
             rows = clips.rows("intensity", intensity, single=single, ndim=2)
-            spoken = [row[: clip.frames].double() for clip, row in zip(clips.clips, rows, strict=True)]
-            if any(len(speech) < clip.frames for clip, speech in zip(clips.clips, spoken, strict=True)):
+            frame_counts = [row[: clip.frames].double() for clip, row in zip(clips.clips, rows, strict=True)]
+            if any(len(speech) < clip.frames for clip, speech in zip(clips.clips, frame_counts, strict=True)):
                 raise ValueError("an intensity has fewer frames than its motion; cut the motion, or fill up with zeros")
-        return clips.attach("speech", [speech.to(self.counts.device) for speech in clips.finite("speech", spoken)])
+        return clips.attach(
+            "speech", [speech.to(self.counts.device) for speech in clips.finite("speech", frame_counts)]
+        )
 
 
 @metric.register("frame_speech_lip_correlation")
@@ -145,7 +138,7 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
     scale of sound and mesh does not matter, nor does a template.
 
     ``of="gap"`` is the prediction's minus the truth's: negative where the lips follow loudness less
-    than the truth's. Lips that do not vary count 0; a sequence whose speech does not vary, or with fewer
+    than the truth's. Lips that do not vary count 0; a sequence of speech that does not vary, or with fewer
     than three frames, is left out and counted by :meth:`coverage`.
 
     The SLCC of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025) is taken over clips
@@ -174,6 +167,9 @@ class FrameSpeechLipCorrelation(SpeechLipMetric):
         return of_side(self.of, clip, follow)
 
 
+frame_speech_lip_correlation = functional(FrameSpeechLipCorrelation)
+
+
 # Columns of the sums that are kept for each identity; for the lips the sum, sum of squares, and sum of products with
 # the speech.
 _CLIPS, _FRAMES, _SPEECH, _SPEECH_SQUARED = range(4)
@@ -194,13 +190,13 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
     and SLCC is Pearson's correlation over all clips, which is Σ_k (n_k − 1) r_k / Σ_k (n_k − 1) with n_k clips
     and the correlation r_k of identity k. From −1 to 1, without unit.
 
-    Definition and name are those of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025)
+    Definition and name are from "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025)
     and its released scripts, which take S over the whole sound; that is the same where every frame
     holds the same number of samples. The paper reports it next to the truth's: ``of="truth"``, and
     ``of="gap"`` for the prediction's minus the truth's.
 
-    Choices where the scripts are silent: an identity with one clip, or whose speech is as loud in every
-    clip, does not enter, and one whose lips do not vary counts 0 (the scripts drop it). A clip of one frame has
+    Choices where the scripts are silent: an identity with one clip, or with speech as loud in every
+    clip, does not enter, and one with lips that do not vary counts 0 (the scripts drop it). A clip of one frame has
     no motion and is left out. :meth:`coverage` counts all these.
 
     Memory grows with ``n_identities``, not with clips or frames.
@@ -252,14 +248,9 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         intensity: Tensor | None = None,
         **batch: Unpack[UpdateOptions],
     ) -> None:
-        """Add a batch of sequences with their speech.
+        """Add a batch of sequences with their speech; see :meth:`SpeechLipMetric.update`.
 
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: of the same shape as the prediction.
-            identities: number of each sequence's identity, below ``n_identities``; needed unless there is one.
-            waveform: the sound; see :meth:`SpeechLipMetric.update`.
-            intensity: instead of a waveform: its intensity in each frame, (batch, frames) or (frames,).
+        ``identities`` has the number of each sequence's identity, below ``n_identities``; needed unless there is one.
         """
         clips = self.align(prediction, truth, **batch)
         clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)
@@ -306,11 +297,14 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         return _standardised_correlation(moments, self.of)
 
     def covered(self) -> Coverage:
-        """What the states of this process count as scored, cut and left out."""
+        """Sequences of this process that were scored, cut and left out."""
         moments, all_clips = self.moments[self._enter()], int(self.moments[:, _CLIPS].sum())
         sequences, frames = int(moments[:, _CLIPS].sum()), int(moments[:, _FRAMES].sum())
         cut_prediction, cut_truth, left_out = self.counts[2:].tolist()
         return Coverage(frames, sequences, cut_prediction, cut_truth, left_out + all_clips - sequences)
+
+
+clip_speech_lip_correlation = functional(ClipSpeechLipCorrelation)
 
 
 def _standardised_correlation(moments: Tensor, side: str) -> Tensor:
@@ -328,7 +322,3 @@ def _deviation(moments: Tensor, total: int, squared: int) -> Tensor:
     """Sum of squared deviations from the mean; 0 where they are no more than rounding."""
     deviation = moments[:, squared] - moments[:, total].square() / moments[:, _CLIPS].clamp(min=1)
     return torch.where(deviation > 1e-12 * moments[:, squared], deviation, 0.0)
-
-
-frame_speech_lip_correlation = functional(FrameSpeechLipCorrelation)
-clip_speech_lip_correlation = functional(ClipSpeechLipCorrelation)

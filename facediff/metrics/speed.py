@@ -21,13 +21,12 @@ class RealTimeFactor(ExactMetric):
     """Real-time factor (RTF): seconds of computing over seconds of speech, summed over clips.
 
     RTF = Σ computing / Σ speech over all clips: below 1 is faster than speech. Clips count by their length;
-    it is no mean of factors. Over several processes the times of all are added, so the factor is that of one
-    process on one device, whatever their number. What is timed (audio features, sampling, copies,
-    files) and the batch size are for the caller to say: the first calls on a device are slow and are best
-    left out.
+    it is no mean of factors. Over several processes the times of all are added, so the factor describes one
+    process on one device. The caller chooses the timed parts (audio features,
+    sampling, copies, files) and the batch size: the first calls on a device are slow and are best left out.
 
     Args:
-        hardware: what it was computed on, for the summary: see :func:`device_name`.
+        hardware: the device, for the summary: see :func:`device_name`.
 
     >>> metric = RealTimeFactor("one core")
     >>> metric.update(1.0, 10.0)
@@ -58,19 +57,15 @@ class RealTimeFactor(ExactMetric):
         """
         device = self.seconds.device
         times = [torch.as_tensor(value, device=device).double().reshape(-1) for value in (computing, speech)]
-        took, spoken = times
-        sensible = took.shape == spoken.shape and took.isfinite().all() and spoken.isfinite().all()
-        if not sensible or bool((took < 0).any() | (spoken <= 0).any()):
-            raise ValueError(f"computing {took.tolist()} and speech {spoken.tolist()} must be positive seconds")
-        self.seconds = self.seconds + torch.stack([took.sum(), spoken.sum()])
+        took, duration = times
+        sensible = took.shape == duration.shape and took.isfinite().all() and duration.isfinite().all()
+        if not sensible or bool((took < 0).any() | (duration <= 0).any()):
+            raise ValueError(f"computing {took.tolist()} and speech {duration.tolist()} must be positive seconds")
+        self.seconds = self.seconds + torch.stack([took.sum(), duration.sum()])
 
     @contextmanager
     def measure(self, speech: float) -> Iterator[None]:
-        """Time the body of ``with`` and add it; work on GPUs is waited for before and after.
-
-        Args:
-            speech: seconds of speech that it is computed for.
-        """
+        """Time the body of ``with`` and add it; work on GPUs is waited for before and after."""
         _wait_for_gpus()
         start = time.perf_counter()
         yield
@@ -90,7 +85,7 @@ real_time_factor = functional(RealTimeFactor)
 
 
 def device_name(device: torch.device | str) -> str:
-    """What a device is called: the GPU's product name, or the processor with torch's number of threads."""
+    """Name of a device: the GPU's product name, or the processor with torch's number of threads."""
     device = torch.device(device)
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
@@ -98,8 +93,8 @@ def device_name(device: torch.device | str) -> str:
         return str(device)
     processor = platform.processor() or platform.machine() or "CPU"
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
-        named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-        processor = next(named, processor)
+        names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+        processor = next(names, processor)
     return f"{processor}, {counted(torch.get_num_threads(), 'thread')}"
 
 

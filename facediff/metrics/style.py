@@ -31,11 +31,11 @@ _ROWS = 1024
 
 @metric.register("style_retrieval_accuracy")
 class StyleRetrievalAccuracy(ExactMetric):
-    """Style retrieval accuracy: share of style embeddings whose nearest other one has the same label.
+    """Style retrieval accuracy: share of style embeddings with the label of their nearest other.
 
     Leave one out: each embedding is a query for the nearest among all others, and is right if that one carries its
     label, for example the speaker. Where several are equally near it is right by their share, so that order
-    does not matter. An embedding whose label no other carries cannot be right and is no query, but may be
+    does not matter. An embedding with a label of its own cannot be right and is no query, but may be
     found. From 0 to 1; guessing gives about the share of embeddings with the same label.
 
     The accuracy is a common test of speaker embeddings; nearest neighbour, leaving one out and counting ties
@@ -88,13 +88,7 @@ class StyleRetrievalAccuracy(ExactMetric):
     def update(
         self, embeddings: Tensor, labels: Tensor | Sequence[int], *, clip_names: Sequence[str] | None = None
     ) -> None:
-        """Add embeddings.
-
-        Args:
-            embeddings: (batch, dim), floating point.
-            labels: whole numbers (batch,): whose style it is.
-            clip_names: one name per embedding, for messages.
-        """
+        """Add embeddings (batch, dim) with the numbers of their speakers (batch,), and names for messages."""
         if embeddings.ndim != 2 or int(self.width) not in (0, embeddings.shape[1]):
             raise ValueError(
                 f"embeddings have shape {tuple(embeddings.shape)}; expected (batch, {int(self.width) or 'dim'})"
@@ -102,12 +96,12 @@ class StyleRetrievalAccuracy(ExactMetric):
         count, width = embeddings.shape
         numbers = torch.tensor(whole_numbers("labels", labels, count, 2**62), device=self.width.device)
         wide = embeddings.detach().to(self.width.device, torch.float64)
-        bad = ~wide.isfinite().all(1)
+        invalid = ~wide.isfinite().all(1)
         if self.closeness == "cosine":
-            bad |= (wide == 0).all(1)
-        if bool(bad.any()):
-            place = int(bad.nonzero()[0])
-            name = f"embedding {place} of the batch" if clip_names is None else f"the embedding of {clip_names[place]}"
+            invalid |= (wide == 0).all(1)
+        if bool(invalid.any()):
+            row = int(invalid.nonzero()[0])
+            name = f"embedding {row} of the batch" if clip_names is None else f"the embedding of {clip_names[row]}"
             raise ValueError(f"{name} holds NaN or infinity, or is all zero; repair it or omit it")
         if not count:
             return
@@ -153,18 +147,21 @@ class StyleRetrievalAccuracy(ExactMetric):
         return embeddings, labels
 
 
+style_retrieval_accuracy = functional(StyleRetrievalAccuracy)
+
+
 def _is_query(labels: Tensor) -> Tensor:
     """Which embeddings have another of their label."""
-    _, places, counts = torch.unique(labels, return_inverse=True, return_counts=True)
-    return counts[places] > 1
+    _, groups, counts = torch.unique(labels, return_inverse=True, return_counts=True)
+    return counts[groups] > 1
 
 
-# Nearest speaker: whose motion is it?
+# Nearest speaker.
 
 
 @dataclass(frozen=True, eq=False)
 class SpeakerGallery:
-    """Recordings whose speakers are known, each by its mean motion.
+    """Recordings of known speakers, each by its mean motion.
 
     Args:
         means: the mean over time of each recording's offsets from its speaker's template, (recordings, vertices, 3).
@@ -177,13 +174,13 @@ class SpeakerGallery:
 
 @metric.register("nearest_speaker_accuracy")
 class NearestSpeakerAccuracy(SequenceMetric):
-    """Nearest-speaker accuracy: share of motions whose mean is nearest to that of the speaker whom they should show.
+    """Nearest-speaker accuracy: share of motions with a mean nearest to their own speaker's.
 
     People differ in how they hold and move their faces, and so in the mean m of their offsets over a sequence. A
-    gallery of recordings (the training clips, and those of no split for unseen speakers) says how: m is taken in the
-    first principal components of the gallery's means; there, with C the covariance within speakers, which is what mood
-    and words do, and S = C + ``shrinkage`` · tr(C) / K · I, the nearest speaker is the one whose mean m̄ has the
-    smallest (m − m̄)ᵀ S⁻¹ (m − m̄). Guessing gives 1 / speakers, and the true motion is the
+    gallery of recordings (the training clips, and recordings of no split for unseen speakers) says how: m is taken in
+    the first principal components of the gallery's means; there, with C the covariance within speakers, which mood and
+    words cause, and S = C + ``shrinkage`` · tr(C) / K · I, the nearest speaker is the one with a mean m̄ at the
+    smallest distance (m − m̄)ᵀ S⁻¹ (m − m̄). Guessing gives 1 / speakers, and the true motion is the
     ceiling, which depends on K: of Puppet's test splits A and B (10 speakers) it names 70 % and 53 % with 16
     components, 92 % and 88 % with 64. Compare with it only. Definition ours.
 
@@ -191,7 +188,7 @@ class NearestSpeakerAccuracy(SequenceMetric):
     ``facediff generation-metrics`` does.
 
     Args:
-        gallery: recordings whose speakers are known.
+        gallery: recordings of known speakers.
         components: principal components K, at most; ``facediff generation-metrics`` takes 64.
         shrinkage: how much of an even covariance is added, so that no direction decides alone.
 
@@ -208,7 +205,7 @@ class NearestSpeakerAccuracy(SequenceMetric):
     centre: Tensor
     basis: Tensor
     whitening: Tensor
-    places: Tensor
+    speaker_means: Tensor
     numbers: Tensor
 
     def __init__(
@@ -233,21 +230,21 @@ class NearestSpeakerAccuracy(SequenceMetric):
         apart = means - centre
         # The products of recordings with one another have the same components as a covariance of (3V, 3V).
         values, vectors = torch.linalg.eigh(apart @ apart.T)
-        kept = [place for place in reversed(range(len(values))) if values[place] > 1e-10 * values[-1]][:components]
-        basis = vectors[:, kept].T @ apart
+        selected = (values > 1e-10 * values[-1]).nonzero().flatten().flip(0)[:components]
+        basis = vectors[:, selected].T @ apart
         basis = basis / basis.norm(dim=1, keepdim=True)
-        places = apart @ basis.T
-        own = torch.stack([places[speaker == number].mean(0) for number in range(len(numbers))])
-        within = places - own[speaker]
+        projections = apart @ basis.T
+        centres = torch.stack([projections[speaker == number].mean(0) for number in range(len(numbers))])
+        within = projections - centres[speaker]
         covariance = within.T @ within / max(1, len(speaker) - len(numbers))
         even = covariance.diagonal().mean() if bool(within.any()) else torch.ones(())
-        shrunk = covariance + shrinkage * even * torch.eye(len(kept), dtype=torch.float64)
+        shrunk = covariance + shrinkage * even * torch.eye(len(selected), dtype=torch.float64)
         whitening = torch.linalg.cholesky(torch.linalg.inv(shrunk))
         for name, value in (
             ("centre", centre),
             ("basis", basis),
             ("whitening", whitening),
-            ("places", own @ whitening),
+            ("speaker_means", centres @ whitening),
             ("numbers", numbers),
         ):
             self.register_buffer(name, value, persistent=False)
@@ -262,8 +259,8 @@ class NearestSpeakerAccuracy(SequenceMetric):
         mean = clip.prediction.double().mean(0)
         if clip.template is not None:
             mean = mean - clip.template.double()
-        place = (mean.flatten() - self.centre) @ self.basis.T @ self.whitening
-        nearest = self.numbers[(self.places - place).square().sum(1).argmin()]
+        projected = (mean.flatten() - self.centre) @ self.basis.T @ self.whitening
+        nearest = self.numbers[(self.speaker_means - projected).square().sum(1).argmin()]
         in_gallery = (self.numbers == clip.identity).any()
         return torch.where(in_gallery, (nearest == clip.identity).double(), torch.nan)
 
@@ -275,13 +272,10 @@ class NearestSpeakerAccuracy(SequenceMetric):
         template: Tensor | None = None,
         **batch: Unpack[UpdateOptions],
     ) -> None:
-        """Add a batch of sequences.
+        """Add a batch of sequences (batch, frames, vertices, 3).
 
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            identities: the number of the speaker whom each sequence should show.
-            template: neutral vertices, when the prediction is absolute vertices. **None means that it is offsets from
-                the template already.**
+        ``identities`` are the numbers of the speakers whom they should show, ``template`` the neutral vertices of an
+        absolute prediction. **None means that it is offsets from the template already.**
         """
         clips = self.align(prediction, prediction, **batch)
         clips = clips.attach_templates(template)
@@ -289,5 +283,4 @@ class NearestSpeakerAccuracy(SequenceMetric):
         self.add(clips.attach("identity", numbers))
 
 
-style_retrieval_accuracy = functional(StyleRetrievalAccuracy)
 nearest_speaker_accuracy = functional(NearestSpeakerAccuracy)

@@ -24,7 +24,7 @@ def warp(distances: Tensor) -> tuple[float, Path]:
     its pairs, both ends included (Sakoe and Chiba 1978, without slope weights or a band). Where ways cost the
     same, the path comes diagonally if it can, else from (i − 1, j).
 
-    Time is O(rows · columns), vectorised along anti-diagonals, whose cells do not depend on one another: about
+    Time is O(rows · columns), vectorised along anti-diagonals of independent cells: about
     50 ms for two series of 600 frames on a CPU, to which the distances are moved.
 
     Args:
@@ -60,10 +60,10 @@ def _skew(distances: Tensor) -> Tensor:
 
 def _trace(costs: Tensor, rows: int, columns: int) -> Path:
     """The path that leads to the last pair, from the costs by anti-diagonal."""
-    both, one = costs[:-2, :-1], costs[1:-1, :-1]
-    other = costs[1:-1, 1:]
-    diagonally = (both <= one) & (both <= other)
-    steps = torch.where(diagonally, 0, torch.where(one <= other, 1, 2)).tolist()
+    diagonal, first = costs[:-2, :-1], costs[1:-1, :-1]
+    second = costs[1:-1, 1:]
+    diagonally = (diagonal <= first) & (diagonal <= second)
+    steps = torch.where(diagonally, 0, torch.where(first <= second, 1, 2)).tolist()
     row, column = rows - 1, columns - 1
     path = [(row, column)]
     while row or column:
@@ -82,7 +82,7 @@ class LipWarpingDistance(LipMetric):
     warping path from the first frames to the last, divided by the number of pairs on that path; then the mean
     over sequences, in the vertices' unit. See :func:`warp` for the path and its ties. A template cancels.
 
-    The distance is never larger than the mean of d(t, t): what it is smaller by is error of timing.
+    The distance is never larger than the mean of d(t, t): the difference is error of timing.
 
     Imitator's paper reports a lip DTW; no released code of it is known, so the local distance, the norm and
     the mean over sequences are choices. Lengths follow the length rule first, as with every metric here.
@@ -117,6 +117,9 @@ class LipWarpingDistance(LipMetric):
         return torch.tensor(cost / len(path), dtype=torch.float64, device=truth.device)
 
 
+lip_warping_distance = functional(LipWarpingDistance)
+
+
 # Early or late: the opening's maxima and minima, paired along a warping path.
 
 
@@ -132,8 +135,8 @@ def smooth(series: Tensor, deviation: float) -> Tensor:
     weights = torch.exp(-0.5 * (torch.arange(radius + 1, dtype=torch.float64) / deviation).square())
     weights = weights / (2 * weights[1:].sum() + weights[0])
     frames = len(series)
-    places = torch.arange(-radius, frames + radius).remainder(2 * frames)
-    mirrored = series[torch.where(places < frames, places, 2 * frames - 1 - places)]
+    frames_around = torch.arange(-radius, frames + radius).remainder(2 * frames)
+    mirrored = series[torch.where(frames_around < frames, frames_around, 2 * frames - 1 - frames_around)]
     out = mirrored[radius : radius + frames] * weights[0]
     # One order of additions for every frame: a plateau stays one, to the last digit, and has no extremum.
     for reach in range(radius, 0, -1):
@@ -167,12 +170,12 @@ def extrema(series: list[float]) -> dict[int, int]:
 def matched_lags(path: Path, truth: list[float], prediction: list[float]) -> list[int]:
     """Lags |i − j| of the pairs of a path at which both series have a maximum or both a minimum.
 
-    Only of pairs whose frame j of the prediction lies between the truth's neighbouring extrema, or ends.
+    Only of pairs in which frame j of the prediction lies between the truth's neighbouring extrema, or ends.
     """
     turns, predicted_turns = extrema(truth), extrema(prediction)
-    places = sorted(turns)
-    earliest = dict(zip(places, [0, *places], strict=False))
-    latest = dict(zip(places, [*places[1:], len(truth) - 1], strict=False))
+    frames = sorted(turns)
+    earliest = dict(zip(frames, [0, *frames], strict=False))
+    latest = dict(zip(frames, [*frames[1:], len(truth) - 1], strict=False))
     return [
         abs(row - column)
         for row, column in path
@@ -202,7 +205,7 @@ class TemporalMisalignment(OpeningMetric):
 
     Then the mean over sequences, early and late alike.
 
-    The name and the first definition are those of "Perceptually Accurate 3D Talking Head Generation"
+    The name and the first definition are from "Perceptually Accurate 3D Talking Head Generation"
     (Chae-Yeon et al., CVPR 2025): the defaults follow its released script, which uses the one pair of FLAME
     vertices (3531, 3504), on all frames of the prediction and every second one of VOCASET's truth.
     ``at="path"`` is ours.
@@ -237,12 +240,12 @@ class TemporalMisalignment(OpeningMetric):
         check_range("smoothing", smoothing, 0)
         if frames_per_second is not None:
             check_range("frames_per_second", frames_per_second, 1e-9)
-        places = "pairs of like extrema" if at == "extrema" else "all its pairs"
+        scope = "pairs of like extrema" if at == "extrema" else "all its pairs"
         smoothed = f"smoothed over {smoothing:g} frames" if smoothing else "not smoothed"
         unit = "frames" if frames_per_second is None else "ms"
         definition = (
             "in each sequence the mean lag |i − j| on the path of derivative dynamic time warping between "
-            f"the mouth's openings (mean distance of {{pairs}}, {smoothed}), over {places}; mean over sequences "
+            f"the mouth's openings (mean distance of {{pairs}}, {smoothed}), over {scope}; mean over sequences "
             f"[{unit}]"
         )
         super().__init__(pairs, definition=definition, **options)
@@ -264,5 +267,4 @@ class TemporalMisalignment(OpeningMetric):
         return torch.tensor(mean * unit, dtype=torch.float64, device=clip.truth.device)
 
 
-lip_warping_distance = functional(LipWarpingDistance)
 temporal_misalignment = functional(TemporalMisalignment)

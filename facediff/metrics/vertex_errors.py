@@ -79,13 +79,13 @@ class VertexError(SequenceMetric):
         self.root = root
         self.scale = scale
 
-    def wanted(self) -> ErrorOf:
-        """The error, as :func:`facediff.metrics.one_pass.one_pass` is asked for it."""
+    def error_of(self) -> ErrorOf:
+        """The error for :func:`facediff.metrics.one_pass.one_pass`."""
         return ErrorOf(self.indices, self.reduction, self.squared)
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The error of one sequence, mean over its frames."""
-        return self.finished(one_pass(clip.prediction, clip.truth, errors=[self.wanted()])[0][0])
+        return self.finished(one_pass(clip.prediction, clip.truth, errors=[self.error_of()])[0][0])
 
     def finished(self, error: Tensor) -> Tensor:
         """The error of one sequence from its mean over frames: its root, where asked for, in the unit asked for."""
@@ -121,13 +121,16 @@ class MeanVertexError(VertexError):
         super().__init__(None, reduction=reduction, squared=squared, pooling=pooling, root=root, scale=scale, **options)
 
 
+mean_vertex_error = functional(MeanVertexError)
+
+
 @metric.register("lip_vertex_error")
 class LipVertexError(VertexError):
     """Lip vertex error (LVE): the largest error among the lip vertices of each frame, averaged.
 
     Squared and pooled by frames is what CodeTalker's and FaceDiffuser's scripts compute (unit squared);
     unsquared is MeshTalk's paper; squared and pooled by sequences is what DiffSpeaker's code reports; squared with
-    ``root``, pooled by sequences, in millimetres is that of ARTalk and UniLS.
+    ``root``, pooled by sequences, in millimetres is the one of ARTalk and UniLS.
 
     Args:
         lips: lip vertices, a :class:`Region` or indices.
@@ -157,6 +160,9 @@ class LipVertexError(VertexError):
         super().__init__(region, reduction="max", squared=squared, pooling=pooling, root=root, scale=scale, **options)
 
 
+lip_vertex_error = functional(LipVertexError)
+
+
 @metric.register("upper_face_vertex_error")
 class UpperFaceVertexError(VertexError):
     """Upper-face vertex error (UVE): how far the vertices of the upper face are from the truth.
@@ -164,7 +170,7 @@ class UpperFaceVertexError(VertexError):
     The mean over frames of the mean (or largest) distance √e² over the upper-face vertices: what MVE is for
     the whole mesh. There is no usual formula of that name; the mean of unsquared distances is a choice, and
     ``reduction="max", squared=True`` is what LVE's formula gives on this region. Unlike FDD it distinguishes a brow
-    that moves at the wrong moment from one that moves correctly, and so counts against a face whose upper part
+    that moves at the wrong moment from one that moves correctly, and so counts against a face with an upper part that
     is plausible but not the truth's. In the vertices' unit, squared if ``squared``.
 
     Args:
@@ -185,12 +191,15 @@ class UpperFaceVertexError(VertexError):
         super().__init__(as_region(upper, "upper"), reduction=reduction, squared=squared, pooling=pooling, **options)
 
 
+upper_face_vertex_error = functional(UpperFaceVertexError)
+
+
 def dynamics_words(*, sign: Sign, scale: float = 1.0) -> str:
     """The definition of the face dynamics deviation in plain words, in which the region is still to be filled in."""
-    kept = "signed, positive where the prediction moves less" if sign == "signed" else "its absolute value"
+    sign_words = "signed, positive where the prediction moves less" if sign == "signed" else "its absolute value"
     return (
         "in each sequence the mean over {region} of the standard deviation over time (population) of the "
-        f"squared offset from the template, truth minus prediction, {kept}; mean over sequences "
+        f"squared offset from the template, truth minus prediction, {sign_words}; mean over sequences "
         f"[{_unit_words(scale, squared=True)}]"
     )
 
@@ -203,7 +212,7 @@ class FaceDynamicsDeviation(SequenceMetric):
     speaker's neutral template τ and the population standard deviation (ddof 0); FDD is the mean over
     sequences of d (``"signed"``: CodeTalker's script; sequences of opposite sign cancel) or of \|d\|
     (``"absolute"``: FaceDiffuser's second figure). The score is in the vertices' unit squared. Sequences
-    count alike whatever their length; a sequence of one frame does not vary and gives 0.
+    count alike at any length; a sequence of one frame does not vary and gives 0.
 
     Args:
         upper: upper-face vertices, a :class:`Region` or indices.
@@ -250,19 +259,13 @@ class FaceDynamicsDeviation(SequenceMetric):
     def update(
         self, prediction: Tensor, truth: Tensor, *, template: Tensor | None = None, **batch: Unpack[UpdateOptions]
     ) -> None:
-        """Add a batch of sequences.
+        """Add a batch of sequences; see :meth:`SequenceMetric.update`.
 
-        Args:
-            prediction: (batch, frames, vertices, 3) or one sequence (frames, vertices, 3), floating point.
-            truth: of the same shape as the prediction.
-            template: neutral vertices (batch, vertices, 3), or (vertices, 3) for all sequences, when
-                prediction and truth are absolute vertices. **None means that they are offsets from the
-                template already**; absolute vertices without a template give another, meaningless number.
+        ``template`` are the neutral vertices, (batch, vertices, 3) or (vertices, 3) for all sequences, of absolute
+        prediction and truth. **None means that these are offsets from the template already**; absolute vertices without
+        a template give a meaningless number.
         """
         self.add(self.align(prediction, truth, **batch).attach_templates(template))
 
 
-mean_vertex_error = functional(MeanVertexError)
-lip_vertex_error = functional(LipVertexError)
-upper_face_vertex_error = functional(UpperFaceVertexError)
 face_dynamics_deviation = functional(FaceDynamicsDeviation)

@@ -1,8 +1,8 @@
-"""A ragged corpus, padding, and the formulas again in float64 NumPy, written independently of the package."""
+"""A ragged corpus, and padding."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,45 +59,6 @@ def corpus() -> Corpus:
         truths.append((template + motion).astype(np.float32))
         predictions.append((template + rng.uniform(0.6, 1.2) * motion + error).astype(np.float32))
     return Corpus(truths, predictions, templates)
-
-
-def vertex_error_numpy(
-    corpus: Corpus, indices: Sequence[int] | None, *, reduction: str, squared: bool, pooling: str
-) -> float:
-    """MVE and LVE as the definitions read, over the whole corpus at once."""
-    sequences = []
-    for prediction, truth in zip(corpus.predictions, corpus.truths, strict=True):
-        gap = truth.astype(np.float64) - prediction.astype(np.float64)
-        distance = np.sum(gap**2, axis=-1) if squared else np.linalg.norm(gap, axis=-1)
-        if indices is not None:
-            distance = distance[:, list(indices)]
-        sequences.append(distance.mean(1) if reduction == "mean" else distance.max(1))
-    if pooling == "frames":
-        return float(np.concatenate(sequences).mean())
-    return float(np.mean([sequence.mean() for sequence in sequences]))
-
-
-def dynamics_numpy(corpus: Corpus, indices: Sequence[int], *, sign: str) -> float:
-    """FDD as the definition reads."""
-    deviations = []
-    for prediction, truth, template in zip(corpus.predictions, corpus.truths, corpus.templates, strict=True):
-        true = np.sum((truth.astype(np.float64) - template) ** 2, axis=-1)[:, list(indices)]
-        predicted = np.sum((prediction.astype(np.float64) - template) ** 2, axis=-1)[:, list(indices)]
-        deviation = np.std(true, axis=0).mean() - np.std(predicted, axis=0).mean()
-        deviations.append(deviation if sign == "signed" else abs(deviation))
-    return float(np.mean(deviations))
-
-
-@pytest.fixture(scope="session")
-def vertex_error_reference() -> Callable[..., float]:
-    """The NumPy formula of MVE and LVE."""
-    return vertex_error_numpy
-
-
-@pytest.fixture(scope="session")
-def dynamics_reference() -> Callable[..., float]:
-    """The NumPy formula of FDD."""
-    return dynamics_numpy
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Every further metric with every option: how to make it, what to feed it, and its formula in float64 NumPy.
+"""Every metric with every option: how to make it, what to feed it, and its formula in float64 NumPy.
 
 The formulas are written from the definitions, one sequence at a time, without looking at the package. A
 formula gives (value, weight) of a sequence, or None where the sequence has no value. Imported by the tests and, as a
@@ -55,6 +55,11 @@ def pair_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, A
     """Absolute vertices of both sides."""
     batch: dict[str, Any] = corpus.batch(places, extra)
     batch.pop("template")
+    return batch
+
+
+def template_batch(corpus: Corpus, places: Sequence[int], extra: int) -> dict[str, Any]:
+    batch: dict[str, Any] = corpus.batch(places, extra)
     return batch
 
 
@@ -173,11 +178,19 @@ def late_sides(corpus: Corpus, place: int) -> tuple[Array, Array]:
     return np.roll(p, 2, axis=0), g
 
 
-def upper_error(corpus: Corpus, place: int, *, reduction: str, squared: bool) -> tuple[float, float]:
+def vertex_error(
+    corpus: Corpus, place: int, *, region: Sequence[int], reduction: str, squared: bool
+) -> tuple[float, float]:
     p, g = sides(corpus, place)
-    error = np.linalg.norm(g - p, axis=-1)[:, UPPER] ** (2 if squared else 1)
+    error = np.linalg.norm(g - p, axis=-1)[:, list(region)] ** (2 if squared else 1)
     frames = error.mean(1) if reduction == "mean" else error.max(1)
     return frames.mean(), len(g)
+
+
+def dynamics_off(corpus: Corpus, place: int, *, sign: str) -> tuple[float, float]:
+    p, g = (np.sum((x - corpus.templates[place]) ** 2, axis=-1)[:, UPPER] for x in sides(corpus, place))
+    gap = np.std(g, axis=0).mean() - np.std(p, axis=0).mean()
+    return float(gap if sign == "signed" else abs(gap)), 1
 
 
 def opening(x: Array) -> Array:
@@ -515,10 +528,21 @@ def _cases() -> list[Case]:
 
     for reduction, squared, pooling in product(("mean", "max"), (True, False), poolings):
         shape: dict[str, Any] = {"reduction": reduction, "squared": squared}
-        formula: Any = partial(upper_error, **shape)
         options = shape | {"pooling": pooling}
+        expected = pooled(partial(vertex_error, region=UPPER, **shape), pooling)
         twin: Any = partial(fm.upper_face_vertex_error, upper=UPPER, **options)
-        add(fm.UpperFaceVertexError, twin, (UPPER,), options, pair_batch, pooled(formula, pooling))
+        add(fm.UpperFaceVertexError, twin, (UPPER,), options, pair_batch, expected)
+        expected = pooled(partial(vertex_error, region=range(40), **shape), pooling)
+        add(fm.MeanVertexError, partial(fm.mean_vertex_error, **options), (), options, pair_batch, expected)
+    for squared, pooling in product((True, False), poolings):
+        options = {"squared": squared, "pooling": pooling}
+        expected = pooled(partial(vertex_error, region=LIPS, reduction="max", squared=squared), pooling)
+        twin = partial(fm.lip_vertex_error, lips=LIPS, **options)
+        add(fm.LipVertexError, twin, (LIPS,), options, pair_batch, expected)
+    for sign in ("signed", "absolute"):
+        expected = pooled(partial(dynamics_off, sign=sign), "sequences")
+        twin = partial(fm.face_dynamics_deviation, upper=UPPER, sign=sign)
+        add(fm.FaceDynamicsDeviation, twin, (UPPER,), {"sign": sign}, template_batch, expected)
     for pooling, (word, batch) in product(poolings, (("absolute", pair_batch), ("offsets", offsets_batch))):
         options = {"pooling": pooling}
         twin = partial(fm.mouth_opening_difference, pairs=PAIRS, **options)
@@ -534,7 +558,7 @@ def _cases() -> list[Case]:
     add(fm.LipWarpingDistance, twin, (LIPS,), {}, late_batch, pooled(warped_distance, "sequences"))
     for at, smoothing, fps in (("extrema", 2.0, None), ("extrema", 0.0, 25), ("path", 0.0, None), ("path", 1.5, 30.0)):
         options = {"at": at, "smoothing": smoothing, "frames_per_second": fps}
-        formula = partial(misalignment, at=at, smoothing=smoothing, milliseconds=1000 / fps if fps else 1)
+        formula: Any = partial(misalignment, at=at, smoothing=smoothing, milliseconds=1000 / fps if fps else 1)
         twin = partial(fm.temporal_misalignment, pairs=PAIRS, **options)
         add(fm.TemporalMisalignment, twin, (PAIRS,), options, late_batch, pooled(formula, "sequences"))
     for word, batch in (("absolute", pair_batch), ("offsets", offsets_batch)):

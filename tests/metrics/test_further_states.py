@@ -1,4 +1,4 @@
-"""Further metrics as torchmetrics classes: reset, pickling, moves, memory, collections, and what has no value."""
+"""Metrics as torchmetrics classes: forward, reset, pickling, moves, memory, collections, and what has no value."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from facediff.metrics import (
     LipOpeningCorrelation,
     LipSpeedCorrelation,
     LipWarpingDistance,
+    MeanVertexError,
     MotionLiveliness,
     MouthOpeningDifference,
     RealTimeFactor,
+    SequenceMetric,
     SpectrumDistance,
     StyleRetrievalAccuracy,
     TemporalMisalignment,
@@ -50,6 +52,16 @@ def test_reset_pickle_and_copy(case: Case, corpus: Corpus) -> None:
     metric.reset()
     assert metric.coverage() == Coverage(0, 0, 0, 0)
     assert not torch.nn.ModuleList([metric]).state_dict()
+
+
+@pytest.mark.parametrize(
+    "metric", [MeanVertexError(), MeanVertexError(pooling="sequences"), FaceDynamicsDeviation([1, 2])]
+)
+def test_forward_gives_the_batch_and_adds_to_the_whole(metric: SequenceMetric) -> None:
+    first, second = metric(**moving(6)), metric(**moving(3))
+    assert metric.coverage() == Coverage(9, 2, 0, 0)
+    weight = 0.5 if metric.pooling == "sequences" else 2 / 3
+    torch.testing.assert_close(metric.compute(), weight * first + (1 - weight) * second)
 
 
 @one_of_each

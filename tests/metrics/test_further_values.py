@@ -1,4 +1,4 @@
-"""Every further metric and option against float64 NumPy, in any batching and order, padded or not."""
+"""Every metric and option against float64 NumPy, in any batching and order, padded or not."""
 
 from __future__ import annotations
 

@@ -127,10 +127,6 @@ def test_the_outside_project_asks_for_nothing_else() -> None:
     assert re.findall(r"[a-z]\w+", wanted[1]) == ["facediff", "metrics", "numpy"]
 
 
-def test_the_page_tells_how_to_run_these_tests() -> None:
-    assert OWN_TESTS in (ROOT / ".github" / "CONTRIBUTING.md").read_text()
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_fresh_environment_with_the_metrics_alone(files: tuple[list[str], dict[str, float]], tmp_path: Path) -> None:

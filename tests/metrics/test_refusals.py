@@ -42,7 +42,6 @@ WRONG: list[tuple[str, dict[str, Any]]] = [
     ("motion", {"prediction": motion()[:, :, :0], "truth": motion()[:, :, :0]}),
     ("motion", {"prediction": motion(vertices=3), "truth": motion(vertices=3)}),
     ("motion", {"prediction": motion().long()}),
-    ("motion", {"prediction": motion().tolist()}),
     ("motion", {"truth": motion() * NAN}),
     ("motion", {"template": torch.zeros(3, 3)}),
     ("motion", {"template": torch.full((4, 3), NAN)}),
