@@ -17,6 +17,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import keyword
+import pkgutil
 import sys
 import threading
 import types
@@ -70,7 +71,8 @@ class Kind:
 
     Args:
         name: of the kind.
-        modules: import paths of the modules that register the built-in ones, separated by spaces.
+        modules: import paths of the modules that register the built-in ones, separated by spaces; of all modules of a
+            package with ``.*`` behind it.
         title: purpose of an entry of this kind, in a few words.
         component: whether models are made of it; its options are then checked as options of the model.
     """
@@ -120,7 +122,9 @@ class Kind:
                 return
             self._loaded = True
             for module in self._modules:
-                importlib.import_module(module)
+                package = importlib.import_module(module.removesuffix(".*"))
+                for part in pkgutil.iter_modules(package.__path__) if module.endswith(".*") else ():
+                    importlib.import_module(f"{package.__name__}.{part.name}")
             for point in entry_points(group=f"facediff.{self.kind}"):
                 try:
                     self._add(point.name, point.load())
@@ -227,20 +231,7 @@ decoder = Kind("decoder", "facediff.models.decoders", "fused features and style 
 sampler = Kind("sampler", "facediff.models.samplers", "runs the reverse diffusion process", component=True)
 model = Kind(
     "model",
-    "facediff.models.dual_path "
-    "facediff.models.style_content "
-    "facediff.models.published.artalk "
-    "facediff.models.published.codetalker "
-    "facediff.models.published.diffposetalk "
-    "facediff.models.published.diffspeaker "
-    "facediff.models.published.emotalk "
-    "facediff.models.published.facediffuser "
-    "facediff.models.published.faceformer "
-    "facediff.models.published.lam "
-    "facediff.models.published.selftalk "
-    "facediff.models.published.talkingstyle "
-    "facediff.models.published.unitalker "
-    "facediff.models.published.voca",
+    "facediff.models.dual_path facediff.models.style_content facediff.models.published.*",
     "a method, as a LightningModule",
 )
 corpus = Kind(

@@ -45,7 +45,6 @@ from facediff.animation.options import GROUPS
 from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
 from facediff.editing.transcripts import align_transcript
-from facediff.models.transcribed import read_words
 from facediff.reporting.statistics import Bootstrap
 from facediff.speech.audio import fit_length, read_speech
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
@@ -361,8 +360,10 @@ class Bench:
     def recorded(self, folder: Path) -> dict[str, float]:
         """Closures of people's recordings, NAME.wav with NAME.txt; their times are found by alignment."""
         files = [path for path in sorted(folder.glob("*.wav")) if path.with_suffix(".txt").is_file()]
-        read = ((read_speech(path), read_words(path.with_suffix(".txt"))) for path in files)
-        return self.strangers(((speech, align_transcript(words, speech)) for speech, words in read), 1, 1)
+        read = ((read_speech(path), path.with_suffix(".txt").read_text(encoding="utf-8-sig")) for path in files)
+        return self.strangers(
+            ((speech, align_transcript(" ".join(text.split()), speech)) for speech, text in read), 1, 1
+        )
 
     def strangers(
         self, said: Iterable[tuple[Array, Sequence[TimedPhoneme]]], draws: int, margin: int = 0

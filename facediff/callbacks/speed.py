@@ -43,7 +43,7 @@ class SpeechFeatureCache(Callback):
         data = trainer.datamodule  # type: ignore[attr-defined]
         model = require_facediff(self, pl_module, data)
         encoder = model.speech_encoder
-        key = encoder.frozen_key() if model.hears_whole_clips else None
+        key = encoder.frozen_key() if model.encodes_whole_clips else None
         if key is None:
             raise FaceDiffError(
                 f"SpeechFeatureCache: {type(model).__name__} encodes random pieces of the speech, or its audio encoder "

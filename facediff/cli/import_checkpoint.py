@@ -58,16 +58,16 @@ def import_checkpoint(
     model = imported.model
     count = sum(parameter.numel() for parameter in model.parameters())
     tell(
-        f"{output}: {type(model).__name__} of {imported.dataset}, {model.n_vertices} "
+        f"{output}: {type(model).__name__} of {imported.facts.dataset}, {model.n_vertices} "
         f"{'vertices' if model.space.is_vertices else 'channels'}, {model.frame_rate:g} "
         f"frames a second, identities {few(model.identities)}, {count / 1e6:.1f} M parameters from "
-        f"{imported.used} tensors"
+        f"{len(imported.weights)} tensors"
     )
-    for names, why in gathered(imported.ignored):
+    for names, why in gathered(imported.files.ignored):
         tell(f"not needed: {names} ({why})")
     for label in model.licences:
         tell(f"licence: {label}")
-    for note in imported.notes:
+    for note in imported.facts.notes:
         tell(f"note: {note}")
     if model.animates:
         tell(f"next: facediff animate speech.wav --checkpoint {output} -o speech.npy")

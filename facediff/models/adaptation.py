@@ -16,7 +16,7 @@ from facediff.models.base import SIZES, AnimationModel
 from facediff.models.dual_path import DualPathDiffusion
 
 Part = Literal["all", "person", "head"]
-"""What is trained: everything, only what holds identity and style, or only what belongs to one face."""
+"""Trained parameters: all, only those that hold identity and style, or only those that belong to one face."""
 
 
 def with_extra_identities(model: AnimationModel, identities: list[str]) -> AnimationModel:
@@ -48,12 +48,7 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
 
 
 def with_new_face(model: AnimationModel, data: SpeechMotionDataModule) -> AnimationModel:
-    """A model of another face with the trunk of a trained dual-path model, and a head that knows nothing yet.
-
-    Args:
-        model: a trained dual-path model, of one face or of many.
-        data: the new face's corpus, whose folder is there.
-    """
+    """A model of another face with the trunk of a trained dual-path model, and a head that knows nothing yet."""
     if not isinstance(model, DualPathDiffusion):
         raise FaceDiffError(
             f"--face: {type(model).__name__} has no trunk that other faces could share; expected a checkpoint of "
@@ -79,7 +74,9 @@ def with_audio_encoder(model: AnimationModel, encoder: dict[str, Any]) -> Animat
         model: a trained model.
         encoder: the encoder as a checkpoint's hyperparameters name it: ``class_path`` and ``init_args``.
     """
-    if model.hears_all or "audio_encoder" not in model.hparams:  # the published methods have rules for their own one
+    if (
+        model.counts_own_frames or "audio_encoder" not in model.hparams
+    ):  # the published methods have rules for their own one
         raise FaceDiffError(f"{type(model).__name__}: its audio encoder cannot be replaced")
     options = {key: value for key, value in model.hparams.items() if not key.startswith("_")}
     changed: AnimationModel = instantiate_module(type(model), {**options, "audio_encoder": encoder})
@@ -115,8 +112,8 @@ def train_only(model: AnimationModel, part: Part) -> None:
         for parameter in model.parameters():
             parameter.requires_grad_(id(parameter) not in shared and parameter.requires_grad)
         return
-    chosen = {id(p) for module in model.personal_modules() for p in module.parameters()}
-    if not chosen:
+    trained = {id(p) for module in model.personal_modules() for p in module.parameters()}
+    if not trained:
         raise FaceDiffError("--train person: the model has neither identity nor style to train; train all of it")
     for parameter in model.parameters():
-        parameter.requires_grad_(id(parameter) in chosen and parameter.requires_grad)
+        parameter.requires_grad_(id(parameter) in trained and parameter.requires_grad)

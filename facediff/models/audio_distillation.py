@@ -10,10 +10,10 @@ fine-tuning of zero-shot models"). Recordings of people with their words teach i
 there the teacher hears the corpus's own synthesiser say the same words (:mod:`facediff.models.transcribed`).
 
 **Low latency.** The student gets truncated speech, which ends a moment after a frame, and must reproduce the teacher's
-features of the whole recording. A model whose windows reach further than what is heard animates silence there, from
-which a trained model concludes that the speech is over, and begins to close the mouth: the student must expect of that
-silence what the teacher hears, as far as that can be known. Some pieces stay whole, so that recordings are heard as
-before. The student may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean 2015, "Distilling the
+features of the whole recording. A model with windows that reach beyond the received speech animates silence there, from
+which a trained model concludes that the speech is over, and begins to close the mouth: of that silence, the student
+must predict the teacher's features as far as possible. Some pieces stay whole, so that recordings sound as before.
+The student may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean 2015, "Distilling the
 knowledge in a neural network"): HuBERT takes a fifth of a second for each frame of a stream.
 """
 
@@ -37,7 +37,7 @@ from facediff.data.augmentation import Augmenter, Example, SpeechAugmentation, r
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
-from facediff.models.transcribed import STEP_RATE, Said, read_said
+from facediff.models.transcribed import STEP_RATE, TranscribedRecording, read_transcribed
 from facediff.speech.windows import QUIETEST, WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import USUAL_VOICE_STEPS
@@ -77,19 +77,18 @@ class DistillationOptions:
         steps: training steps.
         batch_size: clips in a step.
         share: of the clips that are augmented; the others keep the student accurate on clean speech.
-        further: how many pieces of further speech are used in addition to the clips, where the corpus has such
+        extra_speech: how many pieces of further speech are used in addition to the clips, where the corpus has such
             (:meth:`facediff.data.SpeechMotionDataModule.further_speech`); they are drawn as often as the clips.
         interpolation: of the weights, from the teacher's (0) to the trained student's (1).
         learning_rate: the highest; it rises over the first twentieth of the steps and falls as a cosine.
         seed: of all random numbers.
-        pauses: share of the pieces that get a pause, in which the background of augmented speech goes on: what the
-            teacher hears in silence, the student is to hear in noise, music and babble.
+        pauses: share of the pieces that get a pause, in which the background of augmented speech goes on, so that the
+            student takes noise, music and babble for the teacher's silence.
         workers: processes that augment speech; 0 for this one.
-        low_latency: the student hears what the model's windows hear at low latency; the teacher always hears the whole
-            recording.
-        whole: with ``low_latency``, the share of the pieces that the student hears as a whole all the same.
-        transcribed: folder of people's recordings with their words (:func:`facediff.models.transcribed.read_said`),
-            or None.
+        low_latency: the student gets the speech of the model's windows at low latency; the teacher the whole recording.
+        complete_share: with ``low_latency``, the share of the pieces of which the student gets all the same everything.
+        transcribed: folder of people's recordings with their words
+            (:func:`facediff.models.transcribed.read_transcribed`), or None.
         transcribed_share: of the pieces that are such recordings.
     """
 
@@ -97,20 +96,20 @@ class DistillationOptions:
     steps: int = USUAL_VOICE_STEPS
     batch_size: int = 12
     share: float = 0.5
-    further: int = 1200
+    extra_speech: int = 1200
     pauses: float = 0.4
     interpolation: float = 0.85
     learning_rate: float = 1e-3
     seed: int = 0
     workers: int = 1
     low_latency: bool = False
-    whole: float = 0.3
+    complete_share: float = 0.3
     transcribed: Path | None = None
     transcribed_share: float = 0.3
 
     @property
     def goal(self) -> str:
-        """What the encoder is adapted to, in words."""
+        """The purpose of the adaptation, in words."""
         return "low latency" if self.low_latency else "other voices"
 
 
@@ -128,7 +127,7 @@ class DistillationBatch(NamedTuple):
         lengths: valid samples of each clip.
         student_input: the same speech, augmented, or a part of it with silence after it (batch, samples).
         student_lengths: valid samples of each piece of it.
-        places: the teacher's step that goes with each of the student's (batch, steps).
+        teacher_steps: the teacher's step that goes with each of the student's (batch, steps).
         steps: of the student's input.
         compared: the student's steps that are compared, as the first of each clip and the one after the last
             (batch, 2).
@@ -140,7 +139,7 @@ class DistillationBatch(NamedTuple):
     lengths: Tensor
     student_input: Tensor
     student_lengths: Tensor
-    places: Tensor
+    teacher_steps: Tensor
     steps: Tensor
     compared: Tensor
     mean: Tensor | None = None
@@ -162,7 +161,7 @@ def distil_audio_encoder(
     """Distil a trained model's audio encoder in place.
 
     Args:
-        model: a trained model, whose audio encoder is the student.
+        model: a trained model; its audio encoder is the student.
         data: the corpus; of its training clips, only the speech is used.
         options: how.
         step_done: called after each step.
@@ -191,10 +190,10 @@ def distil_audio_encoder(
         if options.low_latency:
             model.choose_low_latency()
         windows = model.windows
-    said: list[Said] = []
+    recordings: list[TranscribedRecording] = []
     if options.transcribed is not None:
-        said = read_said(options.transcribed, data, teacher, most=MOST_TRANSCRIBED, seed=options.seed)
-    pairs = SpeechPairs(data, Augmenter(augmentations), options, windows, said)
+        recordings = read_transcribed(options.transcribed, data, teacher, limit=MOST_TRANSCRIBED, seed=options.seed)
+    pairs = SpeechPairs(data, Augmenter(augmentations), options, windows, recordings)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
     optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
@@ -239,21 +238,21 @@ def _steps(samples: Tensor) -> Tensor:
 
 def _features(student: AudioEncoder, speech: DistillationBatch) -> Tensor:
     """The student's features, standardised by the level of all speech so far as in a stream."""
-    heard = speech.student_input, speech.student_lengths, speech.steps
+    arguments = speech.student_input, speech.student_lengths, speech.steps
     if speech.mean is None or speech.deviation is None:
-        features: Tensor = student(*heard)
+        features: Tensor = student(*arguments)
         return features
     with student.at_level(speech.mean[:, None], speech.deviation[:, None]):
-        features = student(*heard)
+        features = student(*arguments)
     return features
 
 
 def _compared(target: Tensor, speech: DistillationBatch) -> tuple[Tensor, Tensor]:
     """The teacher's features of the student's steps, and True on the steps that are compared."""
-    steps = speech.places.clamp_max(target.shape[1] - 1)
-    place = torch.arange(steps.shape[1], device=target.device)[None]
+    steps = speech.teacher_steps.clamp_max(target.shape[1] - 1)
+    column = torch.arange(steps.shape[1], device=target.device)[None]
     first, last = speech.compared[:, :, None].unbind(1)
-    mask = (place >= first) & (place < last)
+    mask = (column >= first) & (column < last)
     return target.gather(1, steps[..., None].expand(-1, -1, target.shape[2])), mask[..., None]
 
 
@@ -275,10 +274,10 @@ def _rate(step: int, steps: int) -> float:
 
 
 class Piece(NamedTuple):
-    """What the student hears of a clip; see :class:`DistillationBatch`."""
+    """The student's part of a clip; see :class:`DistillationBatch`."""
 
     speech: npt.NDArray[np.float32]
-    places: npt.NDArray[np.int64]
+    teacher_steps: npt.NDArray[np.int64]
     compared: tuple[int, int]
     mean: float
     deviation: float
@@ -296,12 +295,12 @@ class SpeechPairs(Dataset[DistillationBatch]):
         augmenter: Augmenter,
         options: DistillationOptions,
         windows: WindowPlan,
-        said: Sequence[Said] = (),
+        transcribed: Sequence[TranscribedRecording] = (),
     ) -> None:
         # Not the data module itself, which may hold what cannot be pickled for a worker.
-        self.corpus, self.clips, self.further = data.corpus, data.clips("train"), data.further_speech()
-        self.augmenter, self.options, self.windows, self.said = augmenter, options, windows, said
-        self._further_speech: dict[int, npt.NDArray[np.float32]] = {}
+        self.corpus, self.clips, self.further_speech = data.corpus, data.clips("train"), data.further_speech()
+        self.augmenter, self.options, self.windows, self.transcribed = augmenter, options, windows, transcribed
+        self._further_pieces: dict[int, npt.NDArray[np.float32]] = {}
 
     def __len__(self) -> int:
         """Number of batches."""
@@ -309,41 +308,43 @@ class SpeechPairs(Dataset[DistillationBatch]):
 
     def __getitem__(self, index: int) -> DistillationBatch:
         """A batch by number."""
-        if index >= len(self):
-            raise IndexError(index)
+        index = range(len(self))[index]
         random = np.random.default_rng([self.options.seed, index])
-        clean, augmented, places = [], [], []
+        clean, augmented, steps_of = [], [], []
         for _ in range(self.options.batch_size):
-            if self.said and random.random() < self.options.transcribed_share:
-                speech, heard, place = self.said[int(random.integers(len(self.said)))].window(WINDOW, random)
+            if self.transcribed and random.random() < self.options.transcribed_share:
+                recording = self.transcribed[int(random.integers(len(self.transcribed)))]
+                speech, student_speech, steps = recording.window(WINDOW, random)
                 if self.options.pauses and random.random() < self.options.pauses:
-                    speech, heard, place = with_pause_in_both(speech, heard, place, random)
+                    speech, student_speech, steps = with_pause_in_both(speech, student_speech, steps, random)
             else:
                 speech = self._speech(random)
                 if self.options.pauses and random.random() < self.options.pauses:
                     speech = with_pause(speech, random)
-                heard, place = speech, np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE))
+                student_speech, steps = speech, np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE))
             clean.append(speech)
-            augmented.append(self._augmented(heard, random) if random.random() < self.options.share else heard)
-            places.append(place)
-        teacher_hears = _padded(clean), _lengths(clean)
+            if random.random() < self.options.share:
+                student_speech = self._augmented(student_speech, random)
+            augmented.append(student_speech)
+            steps_of.append(steps)
+        teacher = _padded(clean), _lengths(clean)
         if not self.options.low_latency:
-            steps = _lengths(places)
-            compared = torch.stack([torch.zeros_like(steps), steps], 1)
+            counts = _lengths(steps_of)
+            compared = torch.stack([torch.zeros_like(counts), counts], 1)
             return DistillationBatch(
-                *teacher_hears, _padded(augmented), _lengths(augmented), _padded(places), steps, compared
+                *teacher, _padded(augmented), _lengths(augmented), _padded(steps_of), counts, compared
             )
-        pieces = [self._piece(*heard, random) for heard in zip(augmented, map(len, places), strict=True)]
-        student, steps_of, *numbers = zip(*pieces, strict=True)
+        pieces = [self._piece(*clip, random) for clip in zip(augmented, map(len, steps_of), strict=True)]
+        student, student_steps, *numbers = zip(*pieces, strict=True)
         return DistillationBatch(
-            *(*teacher_hears, _padded(student), _lengths(student), _padded(steps_of), _lengths(steps_of)),
+            *(*teacher, _padded(student), _lengths(student), _padded(student_steps), _lengths(student_steps)),
             *map(torch.tensor, numbers),
         )
 
     def _piece(self, speech: npt.NDArray[np.float32], steps: int, random: np.random.Generator) -> Piece:
-        """Speech as a window of low latency hears it, at a random place; now and then all of it."""
+        """The speech of a window of low latency at a random time; now and then all of it."""
         size, windows = SAMPLE_RATE // STEP_RATE, self.windows
-        if random.random() < self.options.whole:
+        if random.random() < self.options.complete_share:
             level = _level(speech.astype(np.float64))
             return Piece(speech[: steps * size], np.arange(steps), (0, steps), *level)
         after, ahead = (round(seconds * STEP_RATE) for seconds in (windows.after, windows.ahead))
@@ -353,28 +354,28 @@ class SpeechPairs(Dataset[DistillationBatch]):
         start = max(0, end - int(random.integers(shortest, longest + 1)))
         mean, deviation = _level(speech[: end * size].astype(np.float64))
         # At the mean, which is silence once it is standardised, as in a stream.
-        heard = np.pad(speech[start * size : end * size], (0, silent * size), constant_values=mean)
+        piece = np.pad(speech[start * size : end * size], (0, silent * size), constant_values=mean)
         # More than half a second before the frame, steps have enough context already, and would drown the error of the
         # hard ones. Where nothing is animated ahead, those within the look-ahead are context only.
         frame = end - after - start
         last = min(steps, end + silent) - start if ahead else frame
         compared = (max(0, frame - STEP_RATE // 2), last)
-        return Piece(heard, np.arange(start, end + silent), compared, mean, deviation)
+        return Piece(piece, np.arange(start, end + silent), compared, mean, deviation)
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
         """A clip or a piece of further speech, or a random window of it."""
-        most = max(1, round(WINDOW * self.corpus.frame_rate))
-        if self.further is not None and self.options.further and random.random() < 0.5:
-            number = int(random.integers(self.options.further))
-            if number not in self._further_speech:
-                self._further_speech[number] = self.further(number)
-            speech = self._further_speech[number]
+        limit = max(1, round(WINDOW * self.corpus.frame_rate))
+        if self.further_speech is not None and self.options.extra_speech and random.random() < 0.5:
+            number = int(random.integers(self.options.extra_speech))
+            if number not in self._further_pieces:
+                self._further_pieces[number] = self.further_speech(number)
+            speech = self._further_pieces[number]
             start = int(random.integers(max(1, len(speech) - round(WINDOW * SAMPLE_RATE) + 1)))
             return speech[start : start + round(WINDOW * SAMPLE_RATE)]
         clip = self.clips[int(random.integers(len(self.clips)))]
         frames = self.corpus.frames(clip)
-        start = int(random.integers(frames - most + 1)) if frames > most else 0
-        return self.corpus.read_audio(clip, start, min(frames, start + most)).numpy()
+        start = int(random.integers(frames - limit + 1)) if frames > limit else 0
+        return self.corpus.read_audio(clip, start, min(frames, start + limit)).numpy()
 
     def _augmented(self, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
         """Speech of the same length in another voice, another room or with noise."""
@@ -387,25 +388,25 @@ class SpeechPairs(Dataset[DistillationBatch]):
 
 def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
     """Speech (S,) with a faint pause of 0.3 to 1.5 s, often at an end; what no longer fits is cut off."""
-    place, count = _drawn_pause(len(speech), SAMPLE_RATE, random)
+    start, count = _drawn_pause(len(speech), SAMPLE_RATE, random)
     pause = _faint(count, speech, random)
-    return np.concatenate([speech[:place], pause, speech[place : len(speech) - count]])
+    return np.concatenate([speech[:start], pause, speech[start : len(speech) - count]])
 
 
 def with_pause_in_both(
-    spoken: npt.NDArray[np.float32],
-    heard: npt.NDArray[np.float32],
-    places: npt.NDArray[np.int64],
+    teacher: npt.NDArray[np.float32],
+    student: npt.NDArray[np.float32],
+    steps: npt.NDArray[np.int64],
     random: np.random.Generator,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """The same between the same sounds of a recording and of the corpus's speech: :meth:`Said.window` with a pause."""
+    """A window of a :class:`TranscribedRecording` with a pause between the same sounds of both."""
     size = SAMPLE_RATE // STEP_RATE
-    place, count = _drawn_pause(len(places), STEP_RATE, random)
-    at = int(places[min(place, len(places) - 1)])
-    pause = _faint(count * size, heard, random)
-    heard = np.concatenate([heard[: place * size], pause, heard[place * size :]])[: len(heard)]
-    spoken = np.concatenate([spoken[: at * size], pause, spoken[at * size :]])
-    return spoken, heard, np.concatenate([places[:place], at + np.arange(count), places[place:] + count])[: len(places)]
+    start, count = _drawn_pause(len(steps), STEP_RATE, random)
+    at = int(steps[min(start, len(steps) - 1)])
+    pause = _faint(count * size, student, random)
+    student = np.concatenate([student[: start * size], pause, student[start * size :]])[: len(student)]
+    teacher = np.concatenate([teacher[: at * size], pause, teacher[at * size :]])
+    return teacher, student, np.concatenate([steps[:start], at + np.arange(count), steps[start:] + count])[: len(steps)]
 
 
 def _drawn_pause(length: int, rate: int, random: np.random.Generator) -> tuple[int, int]:

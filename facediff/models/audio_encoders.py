@@ -8,7 +8,6 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, cast
 
 import numpy as np
@@ -31,14 +30,14 @@ Waves = Float[Tensor, "batch samples"]
 """Speech at 16 kHz, mono, padded with zeros."""
 
 Features = Float[Tensor, "batch steps channels"]
-"""What the frozen part of an encoder makes of speech."""
+"""Features of speech from the frozen part of an encoder."""
 
 Lengths = Int[Tensor, " batch"]
 """Valid samples, steps or frames of each clip."""
 
 StepRule = Literal["features", "features_cut", "hidden", "hidden_cut"]
-"""Where the published methods leave a pretrained network's 50 steps a second: its ``features``, what the convolutions
-give, or its last ``hidden`` states are interpolated to the steps wanted, or (``…_cut``) cut after them."""
+"""Where the published methods leave a pretrained network's 50 steps a second: its ``features`` from the convolutions or
+its last ``hidden`` states are interpolated to the model's steps, or (``…_cut``) cut after them."""
 
 
 class AudioEncoder(nn.Module, ABC):
@@ -51,7 +50,7 @@ class AudioEncoder(nn.Module, ABC):
     two further arguments of its :meth:`forward` that no other encoder is given.
 
     Class attributes:
-        takes_padding: whether clips of several lengths are encoded together; else those of one length are.
+        takes_padding: whether clips of several lengths are encoded together; else clips of one length.
 
     An encoder for which loudness matters calls :meth:`standardise`, so that a piece of a long recording is as loud as
     it is in the whole.
@@ -87,13 +86,13 @@ class AudioEncoder(nn.Module, ABC):
         return None
 
     def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
-        """What the frozen part makes of speech, and each clip's valid steps."""
+        """The frozen part's features of speech, and each clip's valid steps."""
         raise NotImplementedError(f"{type(self).__name__} has no frozen part")
 
     def steps_of(self, samples: int) -> int:
         """Steps that the convolutions of a pretrained network make of so many samples, 50 a second but for the ends.
 
-        The published methods count their frames by them, whatever encoder takes the network's place.
+        The published methods count their frames by them, with any encoder in the network's place.
         """
         return convolved(samples, self.convolutions())
 
@@ -108,13 +107,6 @@ class AudioEncoder(nn.Module, ABC):
 
         Here for encoders that follow no such rule: as many frames, spread over the clip evenly.
 
-        Args:
-            audio: as :meth:`forward` takes it.
-            audio_lengths: as :meth:`forward` takes it.
-            steps: number of steps of each clip's features.
-            rule: where they come from.
-            cached: features of the frozen part with their lengths, if they are at hand.
-
         Returns:
             features, ``most_steps = steps.max()``; zero beyond a clip's own steps.
         """
@@ -126,14 +118,7 @@ class AudioEncoder(nn.Module, ABC):
     ) -> Float[Tensor, "batch most_steps width"]:
         """Encode as VOCA does: at ``rate`` steps a second, the first of them where speech begins.
 
-        Here for encoders whose own steps have no such times: as many steps, spread over the clip evenly.
-
-        Args:
-            audio: as :meth:`forward` takes it.
-            audio_lengths: as :meth:`forward` takes it.
-            steps: number of steps of each clip's features.
-            rate: steps a second.
-            cached: features of the frozen part with their lengths, if they are at hand.
+        Here for encoders without such times: as many steps, spread over the clip evenly.
 
         Returns:
             features, ``most_steps = steps.max()``; zero beyond a clip's own steps.
@@ -156,13 +141,13 @@ class AudioEncoder(nn.Module, ABC):
 
 
 class FrozenEncoder(AudioEncoder):
-    """Base of encoders with a frozen part, whose features can be kept on disk."""
+    """Base of encoders with a frozen part; its features can be kept on disk."""
 
     takes_padding = False  # such networks attend to all of a clip, see :func:`by_length`
     out: nn.Linear | None
 
     def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
-        """What is made of the frozen part's features before the map to the model's width; here nothing."""
+        """Process the frozen part's features before the map to the model's width; here not at all."""
         return features, lengths
 
     def states(
@@ -260,23 +245,23 @@ class MelEncoder(AudioEncoder):
         """Standardised log-mel spectra (batch, steps, mels), zero on padding, and each clip's steps."""
         # Autocast has no complex numbers: the spectrum is always taken in float32.
         with torch.autocast(audio.device.type, enabled=False):
-            short = max(0, 2 * self.hop - audio.shape[1])
+            lacking = max(0, 2 * self.hop - audio.shape[1])
             # Padded by half a spectrum's length, so that spectrum i is centred on sample 160 i. The window of 25 ms
             # stands in the middle of 512 samples, a length that the Fourier transform is quick at.
-            padded = nn.functional.pad(audio.float(), (self.n_fft // 2, self.n_fft // 2 + short))
+            padded = nn.functional.pad(audio.float(), (self.n_fft // 2, self.n_fft // 2 + lacking))
             window = nn.functional.pad(self.window, (56, 56))
             if exporting():
                 power = power_by_convolution(padded, window, self.hop)
             else:
                 frames = padded.unfold(1, self.n_fft, self.hop) * window
                 parts = torch.fft.rfft(frames)
-                # Not .abs().square(), whose square root takes longer than the transform.
+                # Not .abs().square(): its square root takes longer than the transform.
                 power = parts.real.square() + parts.imag.square()
             # The logarithm follows loudness as it is perceived; the floor keeps digital silence from becoming −∞.
             spectrum = torch.log(power @ self.filters.T + 1e-5)
         steps = (lengths // self.hop).clamp(min=2)
         mask = frame_mask(steps, spectrum.shape[1])[..., None]
-        # Shifted and scaled, so that what the first convolution gets of speech at unit variance lies around 0.
+        # Shifted and scaled, so that the first convolution's input lies around 0 for speech at unit variance.
         return (spectrum + 2.0) / 4.0 * mask, steps
 
 
@@ -362,16 +347,13 @@ class HubertEncoder(FrozenEncoder):
         self.train_projection = train_projection
         self.hubert.config.apply_spec_augment = spec_augment
         self.hubert.config.layerdrop = layer_drop
-        depth = len(self.hubert.encoder.layers)
-        if frozen_layers > depth:
-            raise ArgumentError({"frozen_layers": frozen_layers}, f"this network has {depth} layers; −1 freezes all")
-        self.frozen_layers = depth if frozen_layers < 0 else frozen_layers
+        self.frozen_layers = frozen_depth(self.hubert, frozen_layers)
         self._frozen = self._freeze(self.frozen_layers)
         self.train()
         self.out = nn.Linear(self.hubert.config.hidden_size, dim)
 
     def checkpoint_init_args(self) -> dict[str, Any]:
-        """What a checkpoint stores in place of ``source``: the configuration as plain data."""
+        """The configuration as plain data, which a checkpoint stores in place of ``source``."""
         return {"config": self.hubert.config.to_dict()}
 
     def _freeze(self, count: int) -> list[str]:
@@ -437,7 +419,7 @@ class HubertEncoder(FrozenEncoder):
         return self.hubert.encoder.layer_norm(hidden) if self._normalises_last else hidden
 
     def _layers(self, hidden: Tensor, first: int, last: int) -> Tensor:
-        """Transformer layers ``first`` to ``last``, with what comes before the first of all."""
+        """Transformer layers ``first`` to ``last``, with the steps before the first of all."""
         encoder = self.hubert.encoder
         if first == 0:
             hidden = hidden + encoder.pos_conv_embed(hidden)
@@ -470,6 +452,14 @@ class HubertEncoder(FrozenEncoder):
         return self._to_the_end(spec_augmented(self.hubert, self.hubert.feature_projection(features)), 0)
 
 
+def frozen_depth(network: PreTrainedModel, frozen_layers: int) -> int:
+    """The number of Transformer layers to freeze: all of a network for −1."""
+    depth = len(network.encoder.layers)
+    if frozen_layers > depth:
+        raise ArgumentError({"frozen_layers": frozen_layers}, f"this network has {depth} layers; −1 freezes all")
+    return depth if frozen_layers < 0 else frozen_layers
+
+
 def spec_augmented(network: PreTrainedModel, hidden: Tensor) -> Tensor:
     """Projected features (batch, steps, channels) in which SpecAugment has masked stretches, in training."""
     settings: Any = network.config
@@ -494,7 +484,7 @@ def in_processes() -> bool:
 
 def with_edges(wave: Waves) -> Float[Tensor, "batch padded"]:
     """Speech with the zeros at either end that make its steps fall where they belong; at least one step long."""
-    # Without the edges 16 000 samples give 49 steps, whose places drift against the frames by nearly a step.
+    # Without the edges 16 000 samples give 49 steps, which drift against the frames by nearly a step.
     return nn.functional.pad(wave, (EDGE, EDGE + max(0, 400 - wave.shape[1] - 2 * EDGE)))
 
 
@@ -516,8 +506,8 @@ def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor
 def fingerprint(layers: int, config: dict[str, Any], parts: dict[str, nn.Module]) -> str:
     """A hash of all that decides the features of a frozen network: its configuration and the weights of its parts."""
     # Neither where the weights came from nor how they are trained changes the features.
-    kept = {key: value for key, value in config.items() if key not in ("_name_or_path", "layerdrop")}
-    digest = hashlib.sha256(json.dumps([layers, EDGE, kept], sort_keys=True, default=str).encode())
+    stable = {key: value for key, value in config.items() if key not in ("_name_or_path", "layerdrop")}
+    digest = hashlib.sha256(json.dumps([layers, EDGE, stable], sort_keys=True, default=str).encode())
     for name, part in parts.items():
         for key, value in sorted(part.state_dict().items()):
             digest.update(f"{name}.{key}.{value.dtype}".encode())
@@ -530,7 +520,7 @@ class CtcEncoder(FrozenEncoder):
     """Logits of a frozen speech recogniser: a pretrained HuBERT, wav2vec 2.0 or WavLM with its CTC head.
 
     Logits over letters hold little of the speaker's voice, so they suit a model that takes
-    content from speech (Chai et al., style-content disentanglement, whose recogniser gave 29 logits 50 times a
+    content from speech (Chai et al., style-content disentanglement, with a recogniser that gave 29 logits 50 times a
     second). The 50 steps a second are interpolated to the motion's frames, or kept where a model asks for 50 a second.
 
     Args:
@@ -552,7 +542,7 @@ class CtcEncoder(FrozenEncoder):
         self.out = nn.Linear(self.recogniser.config.vocab_size, dim)
 
     def checkpoint_init_args(self) -> dict[str, Any]:
-        """What a checkpoint stores in place of ``source``: the configuration as plain data."""
+        """The configuration as plain data, which a checkpoint stores in place of ``source``."""
         return {"config": self.recogniser.config.to_dict()}
 
     def train(self, mode: bool = True) -> CtcEncoder:
@@ -573,7 +563,7 @@ class CtcEncoder(FrozenEncoder):
         )
 
 
-# Pretrained networks: from a directory, from the hub, or from a plain configuration whose weights a checkpoint has.
+# Pretrained networks: from a directory, from the hub, or from a plain configuration, with weights from a checkpoint.
 
 
 def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
@@ -601,14 +591,14 @@ def load_typed(
     encoder: str,
     option: str = SOURCE,
 ) -> PreTrainedModel:
-    """A network whose own configuration says its type, from a directory, the hub, or a configuration without weights.
+    """A network of the type in its own configuration, from a directory, the hub, or a configuration without weights.
 
     Args:
         source: the directory, or the name on the hub.
         config: the configuration as plain data; None to read it from ``source``.
         kinds: how the names of transformers' classes begin, by type.
         head: how they end for a network with this head.
-        what: what is expected, in errors.
+        what: the expected type of network, in errors.
         encoder: the audio encoder that needs it, in errors.
         option: the option that ``source`` comes from, in errors.
     """
@@ -616,9 +606,6 @@ def load_typed(
         import transformers
     path = os.path.expanduser(source)
     if config is None:
-        # A directory that does not exist would be taken for a name on the hub, with a puzzling message.
-        if (source.startswith((".", "/", "~")) or source.count("/") > 1) and not Path(path).is_dir():
-            raise FaceDiffError(f"{option}: no directory {source}; {SOURCE_EXPECTED}")
         with unreadable(source, what, option):
             kind = transformers.PretrainedConfig.get_config_dict(path)[0].get("model_type")
     else:
@@ -641,11 +628,11 @@ def load_typed(
         if bar:
             transformers.utils.logging.enable_progress_bar()
     # The mask embedding is absent from checkpoints that were fine-tuned without SpecAugment; it has no other use.
-    missing = sorted(key for key in info["missing_keys"] if not key.endswith("masked_spec_embed"))
-    if missing:  # they would be random numbers without a word
+    absent_keys = sorted(key for key in info["missing_keys"] if not key.endswith("masked_spec_embed"))
+    if absent_keys:  # they would be random numbers without a word
         raise FaceDiffError(
-            f'{option}: "{source}" holds no complete {what} ({len(missing)} weights are missing, '
-            f"the first is {missing[0]}); its config.json and model.safetensors must belong together"
+            f'{option}: "{source}" holds no complete {what} ({len(absent_keys)} weights are missing, '
+            f"the first is {absent_keys[0]}); its config.json and model.safetensors must belong together"
         )
     # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.
     return model.train()
@@ -662,15 +649,9 @@ def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - o
     return kind.from_dict({key: value for key, value in config.items() if key in options})
 
 
-SOURCE_EXPECTED = (
-    "expected one with config.json and model.safetensors, or a name on the Hugging Face hub such as "
-    "facebook/hubert-base-ls960"
-)
-
-
 @contextmanager
 def unreadable(source: str, what: str, option: str) -> Iterator[None]:
-    """Say in a sentence of what a source is, and where it was named, that it cannot be loaded."""
+    """Name the source and the option that gave it in an error of loading."""
     try:
         yield
     except Exception as error:  # the hub, safetensors, pickle and transformers raise anything

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.data.packed.stores import address_of
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, damaged
 from facediff.hyperparameters import keeps_arguments
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
@@ -53,10 +53,8 @@ DIVERGENCE_INTERVAL = 50
 
 def read_space(space: object, points: int) -> Space:
     """A space, or its state, or None for vertices."""
-    try:
+    with damaged("space", "give the corpus's own"):
         record = Space() if space is None else space if isinstance(space, Space) else Space.from_state(space)
-    except FaceDiffError as error:
-        raise ArgumentError({"space": space}, str(error)) from error
     if not record.is_vertices and len(record.channels) != points:
         raise ArgumentError(
             {"space": record.kind},
@@ -82,9 +80,9 @@ class AnimationModel(PersonStyles, ABC):
         identities: training identities in the order of the identity index; taken from the data module on the command
             line.
         frame_rate: motion frames a second; taken from the data module on the command line.
-        space: what the motion's numbers mean, a :class:`facediff.spaces.Space` or its state; vertices if None; taken
-            from the data module on the command line.
-        channel_weights: what the channels of a parametric space count: by the vertices that the corpus's ``rig`` moves
+        space: the meaning of the motion's numbers, a :class:`facediff.spaces.Space` or its state; vertices if None;
+            taken from the data module on the command line.
+        channel_weights: weights of a parametric space's channels: by the vertices that the corpus's ``rig`` moves
             by them, by their standard ``deviation`` (also where there is no rig), or as they are (``none``).
         motion_scale: ``unit`` multiplies motion by one factor so that training motion has unit variance, ``none``
             leaves it as it is.
@@ -143,7 +141,7 @@ class AnimationModel(PersonStyles, ABC):
         self.n_vertices = n_vertices
         self.space = read_space(space, n_vertices)
         self.channel_weighting: ChannelWeights = channel_weights
-        # What the errors of channels are multiplied by; measured when training begins. Vertices count as they are.
+        # Weights of the errors of channels, measured when training begins. Vertices count as they are.
         self.register_buffer("geometry", None if self.space.is_vertices else torch.eye(n_vertices))
         self.identities = list(identities)
         self.frame_rate = frame_rate
@@ -170,11 +168,7 @@ class AnimationModel(PersonStyles, ABC):
 
     @classmethod
     def for_data(cls, data: SpeechMotionDataModule, **options: Any) -> Self:  # noqa: ANN401
-        """A model whose sizes are those of a corpus, as on the command line.
-
-        Args:
-            data: the corpus.
-            options: the model's other options.
+        """A model with the sizes of a corpus, as on the command line.
 
         Example:
             >>> data = Puppet(batch_size=8)  # doctest: +SKIP
@@ -202,37 +196,24 @@ class AnimationModel(PersonStyles, ABC):
         if "__init__" in vars(cls):
             cls.__init__ = keeps_arguments(cls.__init__)  # type: ignore[method-assign]
 
-    # What a model adds; :meth:`generate_clips` of the base class too.
+    # For a model to implement; :meth:`generate_clips` of the base class too.
 
     @abstractmethod
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """The loss terms of a batch, unweighted, and their weighted sum ``loss``.
-
-        Args:
-            batch: clips with their true motion.
-            generator: source of the loss's random numbers; torch's global one if None.
-        """
+        """The loss terms of a batch, unweighted, and their weighted sum ``loss``."""
 
     def encode_style(
         self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
-        """Style vectors of reference motions; of width 0 for a model without a speaking style.
-
-        Args:
-            reference: offsets from the template.
-            mask: True on valid frames.
-        """
+        """Style vectors of reference motions; of width 0 for a model without a speaking style."""
         return reference.new_zeros(len(reference), 0)
 
     def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
-        """A batch's own style vectors, or else those of its references."""
+        """A batch's own style vectors, or else its references' vectors."""
         return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
 
     def fit_to_features(self, data: SpeechMotionDataModule) -> dict[str, Tensor]:  # noqa: ARG002
-        """Fit again what was fitted to the speech features, after the audio encoder alone was trained.
-
-        Args:
-            data: the corpus of the training, set up.
+        """Fit again the parts that were fitted to the speech features, after the audio encoder alone was trained.
 
         Returns:
             what has changed, by its name in the state dict; by itself a model has nothing of the kind.
@@ -308,7 +289,7 @@ class AnimationModel(PersonStyles, ABC):
         return losses["loss"]
 
     def stop_if_diverged(self, loss: Tensor) -> None:
-        """Stop training whose loss is no number any more: no further step can mend its weights."""
+        """Stop a training with a NaN or infinite loss: no further step can mend its weights."""
         # On an accelerator, looking at every loss would wait for the device. In 16-bit mixed precision an overflow is
         # usual, and the step is skipped.
         looked_at = loss.device.type == "cpu" or self.trainer.global_step % DIVERGENCE_INTERVAL == 0
@@ -359,12 +340,12 @@ class AnimationModel(PersonStyles, ABC):
         for name, view in self.views_of_clips(batch):
             self.evaluation.score(self, split, view, name)
             if self.samples and self.test_samples > 1:
-                drawn = torch.stack([self.generate(view, seed=seed) for seed in range(self.test_samples)])
-                self.evaluation.update(split, "sample_mean", drawn.mean(0), view, name)
+                samples = torch.stack([self.generate(view, seed=seed) for seed in range(self.test_samples)])
+                self.evaluation.update(split, "sample_mean", samples.mean(0), view, name)
             if view.decoy_audio is not None:
                 decoy = replace(view, audio=view.decoy_audio, features=None)
                 self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), view, name)
-        # A test gives every clip a reference of its own speaker and mood; whoever animates has none.
+        # A test gives every clip a reference of its own speaker and mood; an animation has none.
         for view in with_usual_styles(batch, self.default_style) if self.style_of(batch).shape[1] else ():
             self.evaluation.update(split, "usual_style", self.generate(view, seed=0), view)
         # Baselines: the model with speech that does not belong to the clip, and faces that do not move.
@@ -391,8 +372,8 @@ class AnimationModel(PersonStyles, ABC):
         """One prediction of every clip of the batch."""
         motion, assets = self.generate(batch, seed=0), self.assets
         vertices = [
-            assets.to_scored(own, name) + assets.scored.template(name).to(own) if assets.rig else own + template
-            for own, name, template in zip(motion, batch.identity_names, batch.template, strict=True)
+            assets.to_scored(clip, name) + assets.scored.template(name).to(clip) if assets.rig else clip + template
+            for clip, name, template in zip(motion, batch.identity_names, batch.template, strict=True)
         ]
         names = [self.identities[i] if i >= 0 else "unknown" for i in batch.identity.tolist()]
         return [
@@ -401,11 +382,7 @@ class AnimationModel(PersonStyles, ABC):
         ]
 
     def check_training(self, *, resumed: bool) -> None:
-        """Refuse, before a run writes anything, what cannot be trained; by itself a model refuses nothing.
-
-        Args:
-            resumed: whether a checkpoint will be loaded into the model.
-        """
+        """Refuse, before a run writes anything, what cannot be trained; by itself a model refuses nothing."""
 
     def setup(self, stage: str) -> None:
         """Take the assets from the data module; a checkpoint's own replace them when it is loaded.
@@ -432,18 +409,13 @@ class AnimationModel(PersonStyles, ABC):
         self.use_corpus(data, stage)
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
-        """Take a corpus's assets, and measure what training needs of it.
-
-        Args:
-            data: the corpus.
-            stage: of the trainer: fit, validate, test or predict.
-        """
+        """Take a corpus's assets, and measure what training needs of it."""
         if stage != "predict":
             _ = self.evaluation  # an unknown protocol or metric is reported before the corpus is read
         if stage == "fit":
             # The seed that Lightning was given; scores name it, so that runs of one method can be told apart.
             self.provenance |= {"seed": seed} if (seed := os.environ.get("PL_GLOBAL_SEED")) else {}
-            # Those of a checkpoint that is adapted or resumed stay: a model inherits from all that it has learnt from.
+            # Labels of a checkpoint that is adapted or resumed stay: a model inherits from all its training data.
             self.licences = merged(self.licences, data.licences(), network_licences(dict(self.hparams)))
         self.data_source = {
             "class_path": f"{type(data).__module__}.{type(data).__qualname__}",
@@ -481,16 +453,16 @@ class AnimationModel(PersonStyles, ABC):
 
     def attach_mesh(self) -> None:
         """Give the mesh to those mesh encoders that have none yet; their tables are kept in the checkpoint."""
-        waiting = [m for m in self.own_modules() if isinstance(m, MeshEncoder) and not m.attached]
-        if not waiting:
+        encoders = [m for m in self.own_modules() if isinstance(m, MeshEncoder) and not m.attached]
+        if not encoders:
             return
         if self.assets.faces is None:
             raise FaceDiffError(
-                f"mesh_encoder: {type(waiting[0]).__name__} needs the mesh, and {self.assets.corpus} has no "
+                f"mesh_encoder: {type(encoders[0]).__name__} needs the mesh, and {self.assets.corpus} has no "
                 f"mesh file; put one into its folder, or choose mesh_encoder=linear"
             )
         template = self.assets.templates[min(self.assets.templates)]
-        for encoder in waiting:
+        for encoder in encoders:
             encoder.attach(mesh_hierarchy(template.numpy(), self.assets.faces.numpy(), **encoder.mesh_options))
 
     def on_fit_start(self) -> None:
@@ -504,11 +476,7 @@ class AnimationModel(PersonStyles, ABC):
         return None
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
-        """Take from the training split what a model that was never trained needs: principal components of motion.
-
-        Args:
-            data: set up for training.
-            at_least: components that the caller needs, whatever its modules do.
+        """Fit the data-dependent parts of an untrained model to the training split: principal components of motion.
 
         Returns:
             the components of scaled, weighted motion, each as long as its standard deviation; None if no part of
@@ -517,17 +485,17 @@ class AnimationModel(PersonStyles, ABC):
         weights = self.coordinate_weights(data)
         if self.geometry is not None:
             self.geometry.copy_(weights)
-        waiting = [module for module in self.own_modules() if isinstance(module, PrincipalComponents)]
-        count = max([at_least, *(module.count for module in waiting)])
+        components = [module for module in self.own_modules() if isinstance(module, PrincipalComponents)]
+        count = max([at_least, *(module.count for module in components)])
         if not count:
             return None
         mean, shapes = data.principal_motion(count, weights)
-        for module in waiting:
+        for module in components:
             module.attach(mean * self.scale, shapes * self.scale, weights)
         return shapes * self.scale
 
     def coordinate_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "*all"]:
-        """What the coordinates of motion are multiplied by, (n,); of channels the matrix (n, n)."""
+        """Factors of the coordinates of motion, (n,); of channels the matrix (n, n)."""
         points = self.motion_weights(data)
         if self.space.is_vertices:
             return points.flatten()
@@ -536,18 +504,18 @@ class AnimationModel(PersonStyles, ABC):
         return channel_weights(self.assets, covariance.diag(), covariance, points, self.channel_weighting)
 
     def motion_weights(self, data: SpeechMotionDataModule) -> Float[Tensor, "points dims"]:  # noqa: ARG002
-        """What the points of :attr:`weighted_assets` count, in principal components and in losses of channels."""
+        """Weights of the points of :attr:`weighted_assets` in principal components and in losses of channels."""
         weighted = self.weighted_assets
         return torch.ones(weighted.n_vertices, weighted.space.dims)
 
     @property
     def weighted_assets(self) -> Assets:
-        """The assets; of channels with a rig, those of the vertices that the rig moves."""
+        """The assets; of channels with a rig, the assets of the vertices that the rig moves."""
         by_rig = self.assets.rig is not None and self.channel_weighting == "rig"
         return self.assets.mesh if by_rig else self.assets
 
     def weighed(self, motion: Float[Tensor, "*frames points dims"]) -> Float[Tensor, "*frames points dims"]:
-        """Motion whose squared errors count what :attr:`channel_weighting` says; of vertices the motion itself."""
+        """Motion scaled so that squared errors are weighted by :attr:`channel_weighting`; vertices as they are."""
         if self.geometry is None:
             return motion
         # Not in mixed precision: differences over time of half-precision motion are noise.
@@ -574,10 +542,10 @@ class AnimationModel(PersonStyles, ABC):
         Args:
             folder: a folder that does not exist, or is empty.
             half: store the parameters in 16 bits: half as large; the motion differs a little.
-            license: licence of the weights, such as ``apache-2.0``; that of the data if None.
-            name: what the card calls the model; the folder's name if None.
+            license: licence of the weights, such as ``apache-2.0``; the data's if None.
+            name: the model's name in the card; the folder's if None.
             scores: ``test_scores.csv`` that ``facediff test`` wrote for this model, for the card.
-            languages: codes of the languages that it was trained on; those of its corpus if None.
+            languages: codes of the languages that it was trained on; its corpus's if None.
 
         Returns:
             the folder.

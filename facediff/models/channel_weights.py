@@ -1,4 +1,4 @@
-"""What the channels of a parametric space count in losses and principal components: what a rig moves by them.
+"""Weights of a parametric space's channels in losses and principal components, by the movement of a rig.
 
 Of vertices each coordinate counts by itself. Channels overlap: ``jawOpen`` moves a third of a face and ``eyeBlinkLeft``
 an eyelid, and two of them may move the same vertices. With the displacements D of a rig, the squared error of the
@@ -40,7 +40,7 @@ def channel_weights(
         assets: of the corpus.
         variances: of each channel over the training motion.
         covariance: of the channels.
-        points: what the vertices of the rig count, or without a rig the channels.
+        points: weights of the rig's vertices, or without a rig of the channels.
         by: see :data:`ChannelWeights`.
     """
     count, space = len(variances), assets.space
@@ -55,8 +55,8 @@ def channel_weights(
         # The symmetric root: of all roots of the products the one that mixes channels least.
         root = (vectors * values.clamp_min(SMALLEST * float(values.max())).sqrt()) @ vectors.T
         weights[face[:, None], face] = root
-        own = covariance.double()[face[:, None], face]
-        moved = float(torch.einsum("ij,jk,ik->", root, own, root)) / len(face)
+        face_covariance = covariance.double()[face[:, None], face]
+        moved = float(torch.einsum("ij,jk,ik->", root, face_covariance, root)) / len(face)
         for channel in sorted({*range(count)} - {*space.face}):
             weights[channel, channel] = (moved / float(spread[channel])) ** 0.5
     else:

@@ -13,7 +13,7 @@ imported because the file asks for it:
    machine or resolved as ``${…}``.
 4. The assets are those that :meth:`Assets.from_state` accepts, and the weights fit the model that is built.
 
-What a checkpoint may make facediff read are the folders of the corpus that it was trained on, when it is scored on that
+A checkpoint can make facediff read only the folders of the corpus that it was trained on, when it is scored on that
 corpus or adapted; see SECURITY.md.
 """
 
@@ -49,16 +49,17 @@ FACES_PREFIX = "further_faces."
 
 @contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Whatever a damaged content makes its readers raise becomes a sentence that names the file."""
+    """Errors of reading a damaged content become a sentence that names the file."""
     try:
         yield
-    except FaceDiffError as error:
-        raise FaceDiffError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
     except Exception as error:
-        raise FaceDiffError(
-            f"{path}: cannot be read as a model ({brief(error)}); the file is damaged, or install the packages that "
-            f"its components come from, in the versions that wrote it"
-        ) from error
+        problem = str(error)
+        if not isinstance(error, FaceDiffError):
+            problem = (
+                f"cannot be read as a model ({brief(error)}); the file is damaged, or install the packages that its "
+                f"components come from, in the versions that wrote it"
+            )
+        raise FaceDiffError(problem if str(path) in problem else f"{path}: {problem}") from error
 
 
 def read_checkpoint(path: str | os.PathLike[str] | IO[bytes]) -> dict[str, Any]:
@@ -82,12 +83,7 @@ def read_assets(path: Path | str) -> Assets:
 
 
 def corpus_class(path: Path | str, source: Mapping[str, Any]) -> type[SpeechMotionDataModule]:
-    """The data module that a model was trained on, which is registered or imported.
-
-    Args:
-        path: the checkpoint, for messages.
-        source: the model's :attr:`AnimationModel.data_source`.
-    """
+    """The data module that a model was trained on, which is registered or imported."""
     module: type[SpeechMotionDataModule] | None = find_class(corpus, source.get("class_path"), SpeechMotionDataModule)
     if module is None:
         raise unknown_class(path, "data module", source.get("class_path"))
@@ -143,21 +139,17 @@ def read_content(path: str | os.PathLike[str] | IO[bytes], *, weights: bool = Tr
 
 
 def face_content(checkpoint: dict[str, Any], face: str, path: object) -> dict[str, Any]:
-    """The content of a checkpoint of many faces as that of one face's own model, without anything of its training.
-
-    Args:
-        checkpoint: of many faces.
-        face: the name of one that is not the first.
-        path: the file, for messages.
-    """
+    """The content of one face's own model in a checkpoint of many faces, without anything of its training."""
     faces = checkpoint.get(FACES_KEY) or {}
     if face not in faces:
-        known = choices(face, list(faces)) if faces else "it is a model of one face; omit the name"
-        raise FaceDiffError(f"{path}: has no further face {quoted(face)}: {known}")
+        offered = choices(face, list(faces)) if faces else "it is a model of one face; omit the name"
+        raise FaceDiffError(f"{path}: has no further face {quoted(face)}: {offered}")
     prefix = f"{FACES_PREFIX}{face}."
-    weights = {key.removeprefix(prefix): own for key, own in checkpoint["state_dict"].items() if key.startswith(prefix)}
-    counted = (FORMAT_KEY, "pytorch-lightning_version", "epoch", "global_step")
-    shared = {name: checkpoint[name] for name in counted if name in checkpoint}
+    weights = {
+        key.removeprefix(prefix): value for key, value in checkpoint["state_dict"].items() if key.startswith(prefix)
+    }
+    copied = (FORMAT_KEY, "pytorch-lightning_version", "epoch", "global_step")
+    shared = {name: checkpoint[name] for name in copied if name in checkpoint}
     content: dict[str, Any] = {**shared, **faces[face], "state_dict": weights}
     check_content(content, path)
     return content
@@ -166,15 +158,14 @@ def face_content(checkpoint: dict[str, Any], face: str, path: object) -> dict[st
 def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
     """Refuse a content that has not the outer form of a checkpoint of facediff's, and drop options of 1.x in place."""
     parts = {"hyper_parameters", "state_dict", ASSETS_KEY}
-    if not isinstance(checkpoint, dict) or not all(isinstance(checkpoint.get(part), dict) for part in parts):
-        raise FaceDiffError(
-            f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
-            f"{EXPECTED}"
-        )
-    if checkpoint.get(FORMAT_KEY) != FORMAT:
+    complete = isinstance(checkpoint, dict) and all(isinstance(checkpoint.get(part), dict) for part in parts)
+    if not complete or checkpoint.get(FORMAT_KEY) != FORMAT:
         raise FaceDiffError(
             f"{path}: written by another version of facediff, whose checkpoints this one cannot read; train the model "
             f"again with `facediff fit`, or use the version that wrote it"
+            if complete
+            else f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
+            f"{EXPECTED}"
         )
     checkpoint["hyper_parameters"] = without_removed_options(checkpoint["hyper_parameters"], path)
 
@@ -187,10 +178,10 @@ def assets_of(path: Path | str, checkpoint: Mapping[str, Any]) -> Assets:
 
 def model_of(path: Path | str, hparams: Mapping[str, Any]) -> tuple[type[CheckpointContent], dict[str, Any]]:
     """The model's class and its constructor's arguments: components and plain values."""
-    named = hparams.get("_class_path")
-    implementation: type[CheckpointContent] | None = find_class(model, named, CheckpointContent)
+    class_path = hparams.get("_class_path")
+    implementation: type[CheckpointContent] | None = find_class(model, class_path, CheckpointContent)
     if implementation is None:
-        raise unknown_class(path, "model", named)
+        raise unknown_class(path, "model", class_path)
     extra = ("_class_path", "_instantiator", "identities", "space", "faces")
     options = {name: value for name, value in hparams.items() if name not in extra}
     with naming(path):
@@ -214,13 +205,15 @@ def check_sizes(sizes: Mapping[str, Any]) -> None:
         Space.from_state(sizes["space"])
 
 
-def misfit(weights: Mapping[str, torch.Tensor], own: Mapping[str, Any]) -> str:
+def misfit(weights: Mapping[str, torch.Tensor], expected: Mapping[str, Any]) -> str:
     """A sentence about weights that do not fit a model's own; empty if they do."""
-    missing, extra = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
-    other = sorted(name for name in own.keys() & weights.keys() if own[name].shape != weights[name].shape)
-    for names, fault in ((missing, "are missing"), (extra, "are too many"), (other, "are of another shape")):
+    absent_keys, extra = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
+    reshaped = sorted(name for name in expected.keys() & weights.keys() if expected[name].shape != weights[name].shape)
+    for names, fault in ((absent_keys, "are missing"), (extra, "are too many"), (reshaped, "are of another shape")):
         if names:
-            shapes = f" {tuple(weights[names[0]].shape)} in place of {tuple(own[names[0]].shape)}" * (names is other)
+            shapes = f" {tuple(weights[names[0]].shape)} in place of {tuple(expected[names[0]].shape)}" * (
+                names is reshaped
+            )
             return (
                 f"its weights are not those of its model ({len(names)} {fault}, the first is {quoted(names[0])}"
                 f"{shapes}); the file is damaged, or its options were changed"

@@ -1,4 +1,4 @@
-"""What a checkpoint keeps in addition to the weights: assets of the corpus, licences, provenance, speakers' styles.
+"""Contents of a checkpoint in addition to the weights: assets of the corpus, licences, provenance, speakers' styles.
 
 :class:`CheckpointContent` is the part of a model that writes and reads it, and :class:`PersonStyles` the one that
 encodes the speakers from all of their motion, in place of one reference clip (``style_source=person``). How an
@@ -32,19 +32,19 @@ from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licen
 from facediff.utils.limits import quoted
 
 PROVENANCE_KEY = "facediff_provenance"
-"""Where a checkpoint keeps what it was made from, as texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""
+"""Key of a checkpoint's provenance, texts by name: ``parent``, ``epochs``, ``steps``, ``version``."""
 
 COUNTED = {"epochs": "epoch", "steps": "global_step"}
-"""Of the provenance, what a checkpoint of training counts itself, and where."""
+"""Entries of the provenance that a checkpoint of training counts itself, and their keys."""
 
 IMPORTED = "imported"
-"""In the provenance: the method whose authors' checkpoint the weights were imported from."""
+"""In the provenance: the method from which the authors' weights were imported."""
 
 STYLES_KEY = "facediff_styles"
 """Where a checkpoint keeps the speakers' style vectors, if they are of all their motion."""
 
 FACES_KEY = "facediff_faces"
-"""Where a checkpoint of a model of many faces keeps, for every face but the first, what the face's own model would."""
+"""Key of a many-faced model's further faces, each with the content that the face's own model would keep."""
 
 StyleSource = Literal["reference", "person"]
 MotionScale = Literal["unit", "none"]
@@ -116,28 +116,25 @@ class CheckpointContent(LightningModule, Inference):
     def adopt(self, assets: Assets) -> None:
         """Take over a corpus's assets after checking that they fit the model's sizes."""
         sizes = {template.shape[0] for template in assets.templates.values()}
-        for what, mine, theirs in (
+        for what, mine, stored in (
             ("kinds of space", self.space.kind, assets.space.kind),
             ("vertices" if self.space.is_vertices else "channels", {self.n_vertices}, sizes),
             ("spaces", self.space, assets.space),
             ("identities", self.identities, assets.identities),
             ("frames a second", self.frame_rate, assets.frame_rate),
         ):
-            if mine != theirs:
+            if mine != stored:
                 raise FaceDiffError(
-                    f"the model and the corpus {assets.corpus} do not fit: {what} are {mine} in the model and {theirs} "
+                    f"the model and the corpus {assets.corpus} do not fit: {what} are {mine} in the model and {stored} "
                     f"in the corpus; use a checkpoint that was trained on this topology and these identities"
                 )
         self._assets = assets
         self.make_parts(assets)
 
     def make_parts(self, assets: Assets) -> None:
-        """Make modules whose size only the corpus determines; the base class has none.
+        """Make modules that take their size from the corpus; the base class has none.
 
         Called by :meth:`adopt` (possibly more than once) and when a model is cloned for training.
-
-        Args:
-            assets: those of the corpus.
         """
 
     def encode_people(self, weights: Mapping[str, Tensor] | None = None) -> None:
@@ -179,15 +176,9 @@ class CheckpointContent(LightningModule, Inference):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the assets from the checkpoint."""
         if ASSETS_KEY in checkpoint:
-            # Before the weights are loaded: modules whose size follows from the corpus are made by it.
+            # Before the weights are loaded: it makes the modules that take their size from the corpus.
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
-            weights = checkpoint.get("state_dict", {})
-            check_weights("the checkpoint", weights, self.state_dict())
-            if diverged := next((name for name, value in weights.items() if not value.isfinite().all()), None):
-                raise FaceDiffError(
-                    f"its weights {quoted(diverged)} hold NaN or infinity, so the training has diverged; use an "
-                    f"earlier checkpoint, or train again with a lower learning rate"
-                )
+            check_weights("the checkpoint", checkpoint.get("state_dict", {}), self.state_dict())
             self.data_source = checkpoint.get(DATA_SOURCE_KEY) or {}
             self.licences = merged(self.licences, self._stated_licences(checkpoint))
             self.provenance = read_provenance(checkpoint)
@@ -195,33 +186,34 @@ class CheckpointContent(LightningModule, Inference):
             self.person_styles = read_person_styles(checkpoint.get(STYLES_KEY, {}))
 
     def _stated_licences(self, checkpoint: dict[str, Any]) -> tuple[Licence, ...]:
-        """A checkpoint's labels; of one without, written before there were labels, those of its corpus by name."""
+        """A checkpoint's labels; of one without, written before there were labels, its corpus's labels by name."""
         if LICENCES_KEY in checkpoint:
             return read_licences("its labels", checkpoint[LICENCES_KEY])
         corpora: list[type[Any]] = [entry.implementation for entry in corpus]
         module = next((m for m in corpora if getattr(m, "corpus_name", None) == self.assets.corpus), None)
-        own = Licence(f"corpus {self.assets.corpus}") if module is None else module.corpus_licence()
+        licence = Licence(f"corpus {self.assets.corpus}") if module is None else module.corpus_licence()
         options = checkpoint.get("datamodule_hyper_parameters") or {}
         people = [Licence(f"speaker {Path(str(folder)).name}") for folder in options.get("people") or []]
-        return merged([own], people, network_licences(dict(self.hparams)))
+        return merged([licence], people, network_licences(dict(self.hparams)))
 
 
-def check_weights(source: object, weights: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Refuse weights of another kind of number than the model's: copying would convert them without a word."""
+def check_weights(source: object, weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Refuse NaN and infinity, and weights of another kind of number, which copying would convert without a word."""
     for name, value in weights.items():
-        if name in own and own[name].is_floating_point() != value.is_floating_point():
-            raise FaceDiffError(
-                f"{source}: its weights {quoted(name)} are of the type {value.dtype}, and {own[name].dtype} in the "
-                f"model; the file is damaged"
-            )
+        converts = name in expected and expected[name].is_floating_point() != value.is_floating_point()
+        if converts or not value.isfinite().all():
+            problem = "hold NaN or infinity, so the training has diverged; use an earlier checkpoint, or train again"
+            if converts:
+                problem = f"are of the type {value.dtype}, and {expected[name].dtype} in the model; the file is damaged"
+            raise FaceDiffError(f"{source}: its weights {quoted(name)} {problem}")
 
 
 def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
     """A checkpoint's provenance; the epochs and steps of one that says nothing else."""
-    counted = {name: checkpoint.get(key) for name, key in COUNTED.items()}
+    counters = {name: checkpoint.get(key) for name, key in COUNTED.items()}
     return {
         **checkpoint.get(PROVENANCE_KEY, {}),
-        **{name: str(count) for name, count in counted.items() if isinstance(count, int)},
+        **{name: str(count) for name, count in counters.items() if isinstance(count, int)},
     }
 
 
@@ -248,7 +240,7 @@ class PersonStyles(CheckpointContent):
 
     @abstractmethod
     def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
-        """A batch's own style vectors, or else those of its references."""
+        """A batch's own style vectors, or else its references' vectors."""
 
     def default_style(self, identity: str) -> Reference | Style:
         """The style of all of an identity's motion if the model keeps it, else its stored reference."""
@@ -266,9 +258,9 @@ class PersonStyles(CheckpointContent):
         with torch.no_grad():
             style = self.style_of(batch).clone()
         names = list(batch.reference_names)
-        for clip, own in enumerate(styles):
-            if own is not None:
-                style[clip], names[clip] = own.vector.to(style), own.name
+        for clip, clip_style in enumerate(styles):
+            if clip_style is not None:
+                style[clip], names[clip] = clip_style.vector.to(style), clip_style.name
         return replace(batch, style=style, reference_names=names)
 
     def on_validation_epoch_start(self) -> None:
@@ -282,9 +274,6 @@ class PersonStyles(CheckpointContent):
 
         The motion is cut into stretches as long as a style reference; a speaker's style is the mean of the stretches'
         vectors, weighted by their frames. Clips of the evaluated splits are never among them.
-
-        Args:
-            weights: the weights to encode with, by the names of the state dict; the present ones if None.
         """
         step = int(self.trainer.global_step)
         if self.style_source != "person" or self._styles_of_step == step:
@@ -292,7 +281,7 @@ class PersonStyles(CheckpointContent):
         data: SpeechMotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         # functional_call swaps the weights in for the call alone: the model that is training is not touched.
         encoder = StyleEncoding(self)
-        named = {f"model.{name}": value for name, value in (weights or {}).items()}
+        prefixed = {f"model.{name}": value for name, value in (weights or {}).items()}
         # Each module's own mode is restored and not train() called, which would wake up frozen parts in evaluation
         # mode.
         modes = [(module, module.training) for module in self.modules()]
@@ -305,7 +294,7 @@ class PersonStyles(CheckpointContent):
                     parts = torch.split(data.corpus.read_motion(clip).to(self.device), data.reference_frames)
                     lengths = torch.tensor([len(part) for part in parts], device=self.device)
                     mask = frame_mask(lengths, int(lengths.max()))
-                    vectors = torch.func.functional_call(encoder, named, (pad(parts), mask)).float()
+                    vectors = torch.func.functional_call(encoder, prefixed, (pad(parts), mask)).float()
                     total, frames = total + (vectors * lengths[:, None]).sum(0).cpu(), frames + int(lengths.sum())
                 if frames and total.numel():
                     styles[name] = Style(f"all motion of {name} ({counted(len(clips), 'clip')})", total / frames)

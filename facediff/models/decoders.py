@@ -65,7 +65,7 @@ class DecoderFactory(Protocol):
 
 
 class DecoderConstants(NamedTuple):
-    """What the decoding of a clip does not compute in every step.
+    """Constants of a clip's decoding, computed once for all steps.
 
     Attributes:
         tokens: what each block attends to: the style tokens, or the products of them that its attention needs.
@@ -80,7 +80,7 @@ class DecoderConstants(NamedTuple):
 
 @decoder.register("style_transformer")
 class StyleTransformer(Decoder):
-    """Rotary Transformer whose every block attends to the style tokens; not autoregressive.
+    """Rotary Transformer in which every block attends to the style tokens; not autoregressive.
 
     Args:
         dim: channels; given by the model.
@@ -113,14 +113,7 @@ class StyleTransformer(Decoder):
     def forward(
         self, fused: Frames, style: Tokens, mask: FrameMask, prepared: DecoderConstants | None = None
     ) -> Frames:
-        """F_dec of each frame.
-
-        Args:
-            fused: F_fused.
-            style: style tokens.
-            mask: True on valid frames.
-            prepared: as :meth:`prepare` gives it.
-        """
+        """F_dec of each frame."""
         if prepared is None:
             # Training: the attention of each block computes its keys and values from the tokens themselves.
             prepared = DecoderConstants([style] * len(self.blocks), mask, self._rotation(mask.shape[1]))
@@ -216,7 +209,7 @@ class TokenAttention(Attention):
         if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
             return pairs
         key = key / math.sqrt(key.shape[-1])
-        # The maps by head, (heads, head_dim, dim); the bias of W_q becomes the offset, that of W_o is added last.
+        # The maps by head, (heads, head_dim, dim); the bias of W_q becomes the offset, W_o's is added last.
         into = self.query.weight.view(self.num_heads, -1, dim)
         out = self.out.weight.T.reshape(self.num_heads, -1, dim)
         keys = (key @ into).flatten(1, 2).transpose(1, 2)
@@ -225,12 +218,12 @@ class TokenAttention(Attention):
 
 
 class GruConstants(NamedTuple):
-    """What the decoding of a clip does not compute in every step.
+    """Constants of a clip's decoding, computed once for all steps.
 
     Attributes:
         lengths: valid frames of each clip, on the CPU.
         scale: factor on the result, (batch, 1, dim).
-        shift: what is added to it, (batch, 1, dim).
+        shift: added to it, (batch, 1, dim).
     """
 
     lengths: Tensor
@@ -276,14 +269,7 @@ class GruDecoder(Decoder):
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, fused: Frames, style: Tokens, mask: FrameMask, prepared: GruConstants | None = None) -> Frames:
-        """F_dec of each frame.
-
-        Args:
-            fused: F_fused.
-            style: style tokens.
-            mask: True on valid frames.
-            prepared: as :meth:`prepare` gives it.
-        """
+        """F_dec of each frame."""
         lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
         if exporting():
             # Graphs know no packed sequences: they take clips of one length, see ``graph_takes_padding``.
@@ -291,8 +277,8 @@ class GruDecoder(Decoder):
         # Packed, so that the backward direction starts at a clip's own last frame and not in its padding.
         packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
         hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
-        # A residual around the recurrent layers, and the style last, as in FaceDiffuser, whose style scales the states
-        # before the last map.
+        # A residual around the recurrent layers, and the style last, as in FaceDiffuser, where the style scales the
+        # states before the last map.
         return torch.addcmul(shift, self.norm(hidden + fused), scale)
 
     def prepare(self, style: Tokens, mask: FrameMask) -> GruConstants:

@@ -1,7 +1,7 @@
 """DeepSpeech 0.1.0 (Mozilla's form of Hannun et al., "Deep Speech", 2014), the audio encoder of VOCA.
 
 From top to bottom: cepstra of speech, the acoustic network, the frozen graph that its weights come in, the encoder. The
-cepstra are those of the library python_speech_features with its defaults, from the formulas, in float64 as there.
+cepstra follow the library python_speech_features with its defaults, from the formulas, in float64 as there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, damaged
 from facediff.models.audio_encoders import Features, FrozenEncoder, Lengths, Waves, by_length, fingerprint, fourier
 from facediff.models.layers import Width, all_states, exporting, frame_mask, longest, sliding
 from facediff.registry import audio_encoder
@@ -43,7 +43,7 @@ PROJECT = "mozilla/DeepSpeech"
 RELEASE = f"github.com/{PROJECT}/releases/tag/v0.1.0, deepspeech-0.1.0-models.tar.gz"
 
 SIZES = ("inputs", "first", "second", "third", "cell", "fifth", "logits")
-"""The network's sizes: a step's cepstra with their context, the layers in their order, what it gives."""
+"""The network's sizes: a step's cepstra with their context, the layers in their order, its outputs."""
 
 
 # Cepstra.
@@ -73,11 +73,7 @@ def tables() -> tuple[Tensor, Tensor]:
 
 
 def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch steps 26"]:
-    """Mel-frequency cepstra, 100 a second, whose first is the logarithm of the frame's energy.
-
-    Args:
-        samples: whole numbers of 16 bits, at 16 kHz.
-    """
+    """Mel-frequency cepstra, 100 a second; the first is the logarithm of the frame's energy."""
     # python_speech_features' arithmetic in float64 and in its order (pre-emphasis 0.97, 25 ms every 10 ms, 26 filters,
     # lifter 22), since the released DeepSpeech was trained on it and standardising enlarges differences.
     emphasised = torch.cat([samples[:, :1], samples[:, 1:] - 0.97 * samples[:, :-1]], 1)
@@ -104,12 +100,7 @@ def cepstra(samples: Float64[Tensor, "batch samples"]) -> Float64[Tensor, "batch
 
 
 def network_input(audio: Waves, context: int) -> Float[Tensor, "batch steps inputs"]:
-    """What the network takes: 50 steps a second with the cepstra around each, standardised over the clip.
-
-    Args:
-        audio: clips of one length, full scale 1.
-        context: steps on either side.
-    """
+    """The network's input: 50 steps a second with the cepstra around each, standardised over the clip."""
     # The library takes whole numbers, cut off towards zero. Not every accelerator knows float64.
     samples = (audio.cpu().double() * 32768.0).trunc().clamp(-32768, 32767)
     padded = nn.functional.pad(cepstra(samples)[:, ::2], (0, 0, context, context))
@@ -159,14 +150,9 @@ CELL = re.compile(r"(?:^|/)(fw|bw)/\w*lstm_cell/(kernel|weights|bias|biases)$")
 
 
 def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor], dict[str, int], list[str]]:
-    """The network's weights, its sizes, and the constants that it has no use for.
-
-    Args:
-        graph: a frozen graph's constants by name.
-        source: the file, for messages.
-    """
+    """The network's weights, its sizes, and the constants that it has no use for."""
     matched: dict[str, Tensor] = {}
-    left = []
+    left, repeated = [], []
     for name, value in graph.items():
         part = name.rpartition("/")[2]
         cell = CELL.search(name)
@@ -176,13 +162,12 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
         elif part[:1] not in ("h", "b") or part[1:] not in DENSE:
             left.append(name)
             continue
-        if part in matched:
-            raise FaceDiffError(f"{source}: holds several networks ({name}); expected DeepSpeech 0.1.0, {RELEASE}")
+        repeated += [part] if part in matched else []
         matched[part] = value
     expected = {f"{kind}{number}" for number in DENSE for kind in "hb"} | {"fw.k", "fw.b", "bw.k", "bw.b"}
-    if missing := sorted(expected - matched.keys()):
+    if odd := [*repeated, *sorted(expected - matched.keys())]:
         raise FaceDiffError(
-            f"{source}: lacks {', '.join(missing[:3])}, so it is not DeepSpeech's network; expected output_graph.pb of "
+            f"{source}: holds no {odd[0]} or several, so it is not DeepSpeech's network; expected output_graph.pb of "
             f"{RELEASE}"
         )
     try:
@@ -192,12 +177,12 @@ def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tens
         state = state_of(matched, sizes)
         with torch.device("meta"):
             DeepSpeech(sizes).load_state_dict(state, assign=True)
+        if odd := [name for name, value in state.items() if not bool(value.isfinite().all())]:
+            raise ValueError(f"{odd[0]} holds NaN or infinity")
     except (ValueError, IndexError, RuntimeError, ArgumentError) as error:
         raise FaceDiffError(
             f"{source}: its network has another form than DeepSpeech 0.1.0 ({brief(error)}); expected {RELEASE}"
         ) from error
-    if damaged := next((name for name, value in state.items() if not bool(value.isfinite().all())), None):
-        raise FaceDiffError(f"{source}: its {damaged} holds NaN or infinity; the file is damaged")
     return state, sizes, left
 
 
@@ -221,7 +206,7 @@ def state_of(matched: Mapping[str, Tensor], sizes: Mapping[str, int]) -> dict[st
 
 
 def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
-    """Rows of gates in PyTorch's order, where those of the new state come third; TensorFlow has them second."""
+    """Rows of gates in PyTorch's order, where the new state's rows come third; TensorFlow has them second."""
     entry, new, forget, output = rows.reshape(4, cells, *rows.shape[1:])
     return torch.cat([entry, forget, new, output])
 
@@ -265,13 +250,8 @@ class DeepSpeechEncoder(FrozenEncoder):
         super().__init__()
         state: dict[str, Tensor] = {}
         if config is None:
-            path = Path(source).expanduser()
-            if not path.is_file():
-                raise FaceDiffError(
-                    f"audio_encoder.source: no file {source}; expected the graph output_graph.pb of DeepSpeech 0.1.0 "
-                    f"({RELEASE}), converted by tools/convert_tensorflow.py"
-                )
-            state, config, _ = network_of(read_authors_checkpoint(path)[0], source)
+            with damaged("audio_encoder.source", f"expected output_graph.pb of {RELEASE}, converted to .npz"):
+                state, config, _ = network_of(read_authors_checkpoint(Path(source).expanduser())[0], source)
         self.sizes = checked_sizes(config)
         self.context = self.sizes["inputs"] // CEPSTRA // 2
         self.network = DeepSpeech(self.sizes)
@@ -282,7 +262,7 @@ class DeepSpeechEncoder(FrozenEncoder):
         self.width: int = self.sizes["logits"] if dim is None else dim
 
     def checkpoint_init_args(self) -> dict[str, Any]:
-        """What a checkpoint stores in place of ``source``: the sizes, and whose network it is, for its licence."""
+        """The sizes and the network's author (for its licence), which a checkpoint stores in place of ``source``."""
         return {"config": {**self.sizes, "_name_or_path": PROJECT}}
 
     def frozen_key(self) -> str | None:
@@ -302,10 +282,10 @@ class DeepSpeechEncoder(FrozenEncoder):
         # From time 0 with the last logits held, as VOCA's code resamples, not spread over the clip: a step's time must
         # not depend on how long the clip is.
         times = torch.arange(longest(steps), dtype=torch.float64) * (RATE / rate)
-        places = torch.minimum(times[None], lengths.cpu().double()[:, None] - 1)
-        low = places.floor().long()
+        positions = torch.minimum(times[None], lengths.cpu().double()[:, None] - 1)
+        low = positions.floor().long()
         high = torch.minimum(low + 1, lengths.cpu()[:, None] - 1).to(features.device)
-        share = (places - low)[..., None].to(features)
+        share = (positions - low)[..., None].to(features)
         rows = torch.arange(features.shape[0], device=features.device)[:, None]
         resampled = torch.lerp(features[rows, low.to(features.device)], features[rows, high], share)
         resampled = resampled if self.out is None else self.out(resampled)

@@ -1,6 +1,6 @@
 """Options that classes had in 1.x and have no more, for checkpoints and configs that still state them.
 
-An option that went had one value in practice. A file that states this value means what the present version does, and
+An option that went had one value in practice. A file that states this value means the present behaviour, and
 the option is dropped; another value asks for something that is gone, and is refused.
 """
 
@@ -75,7 +75,7 @@ def without_removed_options(content: Any, source: object) -> Any:  # noqa: ANN40
     """Hyperparameters, or a config, without removed options, in every model and component that is described in them.
 
     Args:
-        content: plain data; classes stand in it as ``class_path`` with ``init_args``, that of a checkpoint's model as
+        content: plain data; classes stand in it as ``class_path`` with ``init_args``, a checkpoint's model as
             ``_class_path`` next to its options.
         source: the file, for messages.
 
@@ -98,13 +98,13 @@ def _present(class_path: object, options: Mapping[str, Any], source: object) -> 
     """The options of a class that it still has."""
     removed = _removed_of(class_path)
     for name in removed.keys() & options.keys():
-        usual = removed[name](options) if callable(removed[name]) else removed[name]
-        usual = usual if isinstance(usual, tuple) else (usual,)
-        if usual != (ANY,) and _plain(options[name]) not in usual:
-            now = " or ".join(map(str, usual))
+        defaults = removed[name](options) if callable(removed[name]) else removed[name]
+        defaults = defaults if isinstance(defaults, tuple) else (defaults,)
+        if defaults != (ANY,) and _plain(options[name]) not in defaults:
+            expected = " or ".join(map(str, defaults))
             raise FaceDiffError(
                 f"{source}: {name}={options[name]} of {class_path} is an option of facediff 1.1 that is gone (it is "
-                f"{now} now); use facediff 1.1 for this file, or train the model again without the option"
+                f"{expected} now); use facediff 1.1 for this file, or train the model again without the option"
             )
     return {name: value for name, value in options.items() if name not in removed}
 

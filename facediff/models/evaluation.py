@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ from torchmetrics import Metric
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import pad
-from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.errors import ArgumentError, FaceDiffError, choices, damaged
 from facediff.metrics import (
     Context,
     EnergyScore,
@@ -44,8 +44,8 @@ def conditioned(
 
     A clip of a training identity comes once. ``identities`` are in the order of the identity index.
     """
-    seen = [clip for clip, index in enumerate(batch.identity.tolist()) if index >= 0]
-    unknown = [clip for clip in range(len(batch)) if clip not in seen]
+    clips = [clip for clip, index in enumerate(batch.identity.tolist()) if index >= 0]
+    unknown = [clip for clip in range(len(batch)) if clip not in clips]
     if not unknown or policy == "style_only":
         return [("", batch)]
     if policy == "adapted":
@@ -53,11 +53,9 @@ def conditioned(
             f"unseen_identity=adapted: clip {batch.names[unknown[0]]} is of {batch.identity_names[unknown[0]]}, whom "
             f"the model was not trained on; adapt it with `facediff adapt`, or choose another policy"
         )
-    views = [("", batch.select(seen))] if seen else []
+    views = [("", batch.select(clips))] if clips else []
     unseen = batch.select(unknown)
     for index, name in enumerate(identities):
-        if name not in references:
-            raise FaceDiffError(f"unseen_identity=each_seen: the model holds no style reference of {name}")
         views.append((name, with_identity(unseen, index, references[name])))
     return views
 
@@ -83,9 +81,9 @@ def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Bat
 
 
 def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]) -> list[Batch]:
-    """The clips as ``animate`` makes them where nobody names a style, in one batch for each identity that has one.
+    """The clips as ``animate`` makes them without ``--style``, in one batch for each identity that has one.
 
-    A clip whose own motion is that style is left out: a speaker of evaluated clips only has one of them as reference.
+    A clip that is itself that style is left out: a speaker of evaluated clips only has one of them as reference.
     """
     views = []
     for name in dict.fromkeys(batch.identity_names):
@@ -94,7 +92,7 @@ def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]
         except FaceDiffError:  # nobody animates as this identity without naming a style
             continue
         identities = zip(batch.identity_names, batch.names, strict=True)
-        clips = [place for place, clip in enumerate(identities) if clip[0] == name and clip[1] != named(style)]
+        clips = [index for index, clip in enumerate(identities) if clip[0] == name and clip[1] != named(style)]
         if clips and (not isinstance(style, Style) or style.vector.numel()):
             views.append(with_identity(batch.select(clips), int(batch.identity[clips[0]]), style))
     return views
@@ -113,13 +111,22 @@ asked for them; the model with the style that ``animate`` takes where none is gi
 template, or from the mean of its speaker's training clips; the model given another sentence's speech."""
 
 ENERGY_REGIONS = ("lips", "upper_face")
-"""Regions by whose energy scores the best checkpoint is chosen."""
+"""Regions of the energy scores by which the best checkpoint is chosen."""
 
 PARAMETERS = "param_"
 """How the names of scores begin that are taken of the channels of a parametric space."""
 
 OF_THE_MODEL = {"samples", "conditions", "style", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
+
+
+@contextlib.contextmanager
+def argument(name: str, value: object) -> Iterator[None]:
+    """Name an option of the model in errors of its value."""
+    try:
+        yield
+    except (FaceDiffError, ValueError) as error:
+        raise ArgumentError({name: value}, str(error), located=True) from error
 
 
 class Evaluation:
@@ -137,18 +144,14 @@ class Evaluation:
         validation_samples: int = 2,
         score_by: Sequence[str] = (),
     ) -> None:
-        try:
+        with argument("model.protocol", protocol_name):
             self.protocol = protocol(protocol_name)
-        except ValueError as error:
-            raise ArgumentError({"model.protocol": protocol_name}, str(error), located=True) from error
         self.unseen_identity = unseen_identity
         self.validation_samples = validation_samples
         self.score_by = list(score_by)
         self.energies: dict[str, EnergyScore] = {}
-        try:
+        with argument("model.metrics", list(metrics)):
             self.requests = {request.text: request for request in parse_all(metrics)}
-        except FaceDiffError as error:
-            raise ArgumentError({"model.metrics": list(metrics)}, str(error), located=True) from error
         self.requests |= self.protocol.further()
         self.needs = {need for request in self.requests.values() for need in request.needs}
         self.splits: list[str] = []
@@ -199,21 +202,19 @@ class Evaluation:
 
     @property
     def corpus(self) -> ScoredCorpus:
-        """What :meth:`prepare` was given."""
+        """The corpus of :meth:`prepare`."""
         assert self._corpus is not None  # noqa: S101 - for the type checker
         return self._corpus
 
     def _check_space(self, assets: Assets) -> None:
         """Refuse a protocol that needs vertices, or channels, of a corpus that has none."""
-        protocol, advice = self.protocol.name, "; choose another --model.protocol"
-        if self.protocol.channels and assets.space.is_vertices:
-            raise FaceDiffError(f"protocol {protocol} scores channels, and {assets.corpus} has vertices{advice}")
-        without_rig = not assets.space.is_vertices and assets.rig is None
-        # Before there were protocols of parameters, those of vertices were taken of channels where no rig is known.
-        if self.protocol.unit is not None and without_rig:
+        vertices, protocol = assets.space.is_vertices, self.protocol
+        # Before there were protocols of parameters, channels without a known rig took the vertices' protocols.
+        if (protocol.channels and vertices) or (protocol.unit is not None and not vertices and assets.rig is None):
+            problem = "scores channels" if protocol.channels else f"scores vertices in {protocol.unit}"
+            lack = "has vertices" if vertices else "has channels without a rig that decodes them"
             raise FaceDiffError(
-                f"protocol {protocol} scores vertices in {self.protocol.unit}, and no rig decodes the channels of "
-                f"{assets.corpus}{advice}, or give the corpus a rig"
+                f"protocol {protocol.name} {problem}, and {assets.corpus} {lack}; choose another --model.protocol"
             )
 
     def _scale(self, assets: Assets) -> float:
@@ -250,63 +251,63 @@ class Evaluation:
         }
 
     def _add_energies(self, samples: Tensor, batch: Batch) -> None:
-        """Add a validation batch's samples (batch, samples, frames, V, 3), and those of a still face."""
+        """Add a validation batch's samples (batch, samples, frames, V, 3), and a still face's."""
         if batch.repeated:
             return
-        samples, truth = (self.corpus.decoded(each, batch.identity_names) for each in (samples, batch.motion))
+        samples, truth = (self.corpus.decoded(motion, batch.identity_names) for motion in (samples, batch.motion))
         for name, metric in self.energies.items():
-            drawn = torch.zeros_like(samples) if name.startswith("still") else samples
-            shown = drawn[:, : metric.n_samples].expand(-1, metric.n_samples, -1, -1, -1)
-            metric.to(samples.device).update(shown, truth, lengths=batch.frame_lengths, clip_names=batch.names)
+            generated = torch.zeros_like(samples) if name.startswith("still") else samples
+            repeated = generated[:, : metric.n_samples].expand(-1, metric.n_samples, -1, -1, -1)
+            metric.to(samples.device).update(repeated, truth, lengths=batch.frame_lengths, clip_names=batch.names)
 
     def _energy(self) -> float | None:
-        """The energy score over that of a still face, mean of the regions; empties the metrics."""
+        """The energy score over the still face's, mean of the regions; empties the metrics."""
         shares = []
         for name in ENERGY_REGIONS if self.energies else ():
             with contextlib.suppress(ValueError):  # nothing was validated
-                own, still = (float(self.energies[f"{who}/{name}"].compute()) for who in ("model", "still"))
-                shares += [own / still] if still else []
+                score, still = (float(self.energies[f"{who}/{name}"].compute()) for who in ("model", "still"))
+                shares += [score / still] if still else []
         for metric in self.energies.values():
             metric.reset()
         return sum(shares) / len(shares) if shares else None
 
     def _context(self, model: Inference, corpus: ScoredCorpus, device: torch.device) -> Context:
-        """What the corpus and the model have for metrics, and why they lack the rest."""
+        """Inputs of metrics that the corpus and the model have, and reasons why they lack the rest."""
         context, name = corpus.context(self.needs, device), type(model).__name__
         still = torch.zeros(1, 1, corpus.assets.n_vertices, corpus.assets.space.dims, device=model.device)
         mask = torch.ones(1, 1, dtype=torch.bool, device=model.device)
         with torch.inference_mode():
             styled = "style" in self.needs and model.encode_style(still, mask).shape[1] > 0
-        met = {"samples": model.samples, "conditions": len(self._styles(model)) > 1, "style": styled}
-        missing = {
+        conditions = {"samples": model.samples, "conditions": len(self._styles(model)) > 1, "style": styled}
+        reasons = {
             "samples": f"{name} is deterministic",
             "conditions": "the corpus has no style references of two training identities",
             "style": f"{name} has no style encoder",
         }
-        has = {**context.has, **{need: {} for need, fulfilled in met.items() if fulfilled}}
-        return replace(context, has=has, missing={**context.missing, **missing})
+        has = {**context.has, **{need: {} for need, fulfilled in conditions.items() if fulfilled}}
+        return replace(context, has=has, reasons={**context.reasons, **reasons})
 
     @staticmethod
     def _styles(model: Inference) -> dict[int, Reference | Style]:
         """Styles of the training identities that have a stored reference, by index."""
         assets = model.assets
-        referenced = [(place, name) for place, name in enumerate(assets.identities) if name in assets.references]
-        return {place: model.default_style(name) for place, name in referenced}
+        referenced = [(index, name) for index, name in enumerate(assets.identities) if name in assets.references]
+        return {index: model.default_style(name) for index, name in referenced}
 
     def score(self, model: Inference, split: str, batch: Batch, identity: str = "") -> None:
-        """Generate a batch's motion, and whatever else metrics need of the model, and add its scores.
+        """Generate a batch's motion, with all that metrics need of the model, and add its scores.
 
         ``identity`` is the one that all clips are generated with, if it is not their own.
         """
         start = self._clock(model)
         motion = model.generate(batch, seed=0)
-        spoken = float(batch.frame_lengths.sum()) / model.assets.frame_rate
-        inputs: dict[str, Any] = {"computing": self._clock(model) - start, "speech": spoken}
+        seconds = float(batch.frame_lengths.sum()) / model.assets.frame_rate
+        inputs: dict[str, Any] = {"computing": self._clock(model) - start, "speech": seconds}
         if not batch.repeated:
-            chosen = self.chosen[split]["model"].values()
+            requests = self.chosen[split]["model"].values()
             count = len(self._validation_seeds) if self.energies else 1
             if "samples" in self.needs:
-                count = max(count, *(int(getattr(metric, "n_samples", 1)) for metric in chosen))
+                count = max(count, *(int(getattr(metric, "n_samples", 1)) for metric in requests))
             # A sample is the seed of its noise; the first is the motion that all other metrics score.
             if count > 1 or self.energies or "samples" in self.needs:
                 more = [model.generate(batch, seed=seed) for seed in range(1, count)]
@@ -314,7 +315,7 @@ class Evaluation:
             if self.energies:
                 self._add_energies(inputs["samples"][:, : len(self._validation_seeds)], batch)
             if "conditions" in self.needs:
-                views = [with_identity(batch, place, style) for place, style in self._styles(model).items()]
+                views = [with_identity(batch, index, style) for index, style in self._styles(model).items()]
                 inputs["predictions"] = torch.stack([model.generate(view, seed=0) for view in views], 1)
             if "style" in self.needs:
                 inputs["embeddings"] = model.encode_style(motion, batch.mask)
@@ -366,10 +367,8 @@ class Evaluation:
             own_inputs = inputs | channels if of_channels else inputs
             if "samples" in inputs and hasattr(metric, "n_samples"):
                 own_inputs = inputs | {"samples": inputs["samples"][:, : metric.n_samples]}
-            try:
+            with damaged(f"metric {name}", "check the corpus with `facediff data check`"):
                 feed(metric.to(motion.device), own_inputs, "all" if request is None else request.moment)
-            except ValueError as error:
-                raise FaceDiffError(f"metric {name}: {error}") from error
             scores[name] = metric
         if split == "val":
             return
@@ -378,10 +377,10 @@ class Evaluation:
             for name, metric in scores.items()
             if isinstance(metric, SequenceMetric) and metric.latest is not None
         }
-        for place, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
-            own = {name: scores_of_clips[place] for name, scores_of_clips in values.items()}
+        for row, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
+            clip_scores = {name: scores_of_clips[row] for name, scores_of_clips in values.items()}
             facts = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
-            self._sequences.append({**facts, **self._attributes(clip), **own})
+            self._sequences.append({**facts, **self._attributes(clip), **clip_scores})
 
     def _attributes(self, clip: str) -> dict[str, str | None]:
         """What scores may be grouped by, such as a clip's emotion."""
@@ -451,7 +450,7 @@ class Evaluation:
         """``<split>/<metric>`` of the model and ``<split>/<method>/<metric>`` of the others; empties the metrics.
 
         For validation ``val/energy`` too, by which the best checkpoint is chosen: the energy score of lips and upper
-        face, each over that of a still face. No mean face can win it.
+        face, each over the still face's. No mean face can win it.
         """
         scalars: dict[str, float] = {}
         for row in self.rows(split):
@@ -462,13 +461,13 @@ class Evaluation:
             scalars[f"{split}/energy"] = energy
         for metrics in self.metrics[split].values():
             metrics.reset()
-        for chosen in self.chosen[split].values():
-            for metric in chosen.values():
+        for requests in self.chosen[split].values():
+            for metric in requests.values():
                 metric.reset()
         return scalars
 
     def rows(self, split: str) -> list[dict[str, Any]]:
-        """One row per method: scores, and what they were taken over; collective under several processes.
+        """One row per method: scores and numbers of scored clips and frames; collective under several processes.
 
         A metric that has no value over the whole split has None.
         """
@@ -493,8 +492,8 @@ class Evaluation:
         By the name of the score; see :func:`facediff.metrics.describe_column`.
         """
         of_model = next(iter(self.metrics.values()))["model"].scores()
-        chosen = next(iter(self.chosen.values()), {}).get("model", {})
-        return {name: describe_column(metric) for name, metric in {**of_model, **chosen}.items()}
+        requests = next(iter(self.chosen.values()), {}).get("model", {})
+        return {name: describe_column(metric) for name, metric in {**of_model, **requests}.items()}
 
     def describe(self) -> str:
         """The definitions of all numbers, in words."""

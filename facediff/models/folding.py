@@ -8,7 +8,7 @@ x_{n−1} = a x_n + c x̂₀ + s z, can be followed through E: y_n = E x_n obeys
 Nothing in it has as many dimensions as x, and nothing is approximated. A step of ``ddpm`` on a mesh of 23 370 vertices
 takes 47 ms instead of 398 ms (tools/benchmarks/RESULTS.md).
 
-:class:`VertexSpace` and :class:`FoldedSpace` are the two spaces, for every method whose ends are linear. A sampler of
+:class:`VertexSpace` and :class:`FoldedSpace` are the two spaces, for every method with linear ends. A sampler of
 the dual-path model sees a :class:`ConditionalDenoiser`, made once for each run by ``prepare_for_inference``.
 """
 
@@ -107,7 +107,7 @@ class FoldedSpace:
     def __init__(self, embed: nn.Linear, fold: Fold, rest: Tensor | None = None) -> None:
         self._embed, self._fold = embed, fold
         self.width = embed.out_features
-        # What is added on the vertices must be mapped too: E (U h + b + rest) = E U h + E b + E rest.
+        # Terms added on the vertices must be mapped too: E (U h + b + rest) = E U h + E b + E rest.
         self._offset = None if rest is None else fold.offset + self.project(rest)
 
     def project(self, motion: ScaledMotion) -> State:
@@ -136,12 +136,12 @@ class FoldedSpace:
             return nn.functional.linear(features.to(fold.product), fold.product) + self._offset
 
 
-# What a sampler sees of a network.
+# A network as a sampler sees it.
 
 
 @runtime_checkable
 class DenoisingNetwork(Protocol):
-    """What a denoiser needs of a network.
+    """A denoiser's view of a network.
 
     Attributes:
         coordinates: numbers in a frame of motion, 3V.
@@ -170,7 +170,7 @@ class ConditionalDenoiser:
 
     Args:
         network: predicts clean motion.
-        conditions: what it is conditioned on, with everything else that is constant over the denoising steps. Under
+        conditions: its conditions, with everything else that is constant over the denoising steps. Under
             guidance, all clips with their conditions, then all clips with some of them hidden, and so on.
         fold: the products of the network's ends, to run in their width; None to run on the vertices.
         blend: changes the features that the network gives in every step.
@@ -223,10 +223,10 @@ class ConditionalDenoiser:
             self._last = features, prediction
         return prediction
 
-    def motion(self, sample: State, wanted: slice = slice(None)) -> WantedMotion:  # noqa: B008
+    def motion(self, sample: State, frames: slice = slice(None)) -> WantedMotion:  # noqa: B008
         """Scaled motion of the sampler's result in some frames; where folded, the only map to the vertices."""
         if not isinstance(self.space, FoldedSpace):
-            return sample[:, wanted]
+            return sample[:, frames]
         # y alone does not say where the vertices are. But the last step of a linear sampler returns the last prediction
         # E M̂⁰, and M̂⁰ = U h + b of the features h that the network gave for it, which were kept.
         if self._last is None or not torch.allclose(sample, self._last[1], rtol=1e-3, atol=1e-4, equal_nan=True):
@@ -234,11 +234,11 @@ class ConditionalDenoiser:
                 "sampler: it is declared linear, but its last step does not return the last prediction; "
                 "choose --model.sampling_space=vertices"
             )
-        return self.network.clean_motion(self._last[0][:, wanted])
+        return self.network.clean_motion(self._last[0][:, frames])
 
 
 class PreconditionedDenoiser(ConditionalDenoiser):
-    """Coordinates of motion with known variances; the network predicts what the noisy motion leaves open.
+    """Coordinates of motion with known variances; the network predicts the part that the noisy motion leaves open.
 
     Args:
         network: predicts that.
@@ -281,7 +281,7 @@ CHUNK = 8192
 
 @dataclass(frozen=True)
 class Fold:
-    """What the reverse process of y = E x needs of the two linear maps.
+    """The two linear maps in the reverse process of y = E x.
 
     Attributes:
         product: E U, from the last features to the folded prediction.
@@ -341,11 +341,11 @@ T = TypeVar("T")
 
 
 class WeightCache(Generic[T]):
-    """Keeps what was computed from weights until they are found changed.
+    """Keeps tensors computed from weights until the weights change.
 
     The weights themselves are looked at, through a random projection of each matrix: a version counter does not see
     writes through ``.data``, by which weight averages are swapped in and out. A change that is lost in the rounding of
-    the projections is lost in what is computed as well.
+    the projections is lost in these tensors as well.
     """
 
     def __init__(self) -> None:
@@ -354,20 +354,14 @@ class WeightCache(Generic[T]):
         self._value: T | None = None
 
     def get(self, weights: Sequence[Tensor], key: Hashable, compute: Callable[[], T]) -> T:
-        """What ``compute`` gives for these weights, without gradient and in their own precision.
-
-        Args:
-            weights: everything that the value depends on, matrices and vectors.
-            key: which value is wanted; one is kept at a time.
-            compute: computes it.
-        """
+        """What ``compute`` gives for these weights, without gradient and in their own precision."""
         # Tensors made in inference mode could not be used in training later.
         if exporting() and self._value is not None:
             return self._value  # of the run before; a graph holds it as a constant
         with torch.inference_mode(False), torch.no_grad(), torch.autocast(weights[0].device.type, enabled=False):
-            seen = [projection(weight) for weight in weights]
-            if self._value is None or key != self._key or not same(seen, self._seen):
-                self._value, self._key, self._seen = compute(), key, seen
+            views = [projection(weight) for weight in weights]
+            if self._value is None or key != self._key or not same(views, self._seen):
+                self._value, self._key, self._seen = compute(), key, views
         return self._value
 
 
@@ -380,8 +374,8 @@ def projection(weight: Tensor) -> Tensor:
     return weight @ torch.randn(weight.shape[1], generator=torch.Generator().manual_seed(0)).to(weight)
 
 
-def same(some: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
+def same(first: Sequence[Tensor], second: Sequence[Tensor]) -> bool:
     """Whether tensors are equal one by one, also in type and device."""
-    return len(some) == len(others) and all(
-        a.dtype == b.dtype and a.device == b.device and torch.equal(a, b) for a, b in zip(some, others, strict=True)
+    return len(first) == len(second) and all(
+        a.dtype == b.dtype and a.device == b.device and torch.equal(a, b) for a, b in zip(first, second, strict=True)
     )

@@ -35,7 +35,7 @@ class FusionFactory(Protocol):
 
 
 class FusionConstants(NamedTuple):
-    """What the fusion of a clip does not compute in every step.
+    """Constants of a clip's fusion, computed once for all steps.
 
     Attributes:
         query: of the speech, (batch, heads, frames, head_dim).
@@ -76,14 +76,7 @@ class BidirectionalCrossAttention(Fusion):
     def forward(
         self, audio: Frames, motion: Frames, mask: FrameMask, prepared: FusionConstants | None = None
     ) -> Frames:
-        """F_am = F'_a + F'_m.
-
-        Args:
-            audio: F_a.
-            motion: F_m.
-            mask: True on valid frames.
-            prepared: as :meth:`prepare` gives it.
-        """
+        """F_am = F'_a + F'_m."""
         # Training does not prepare, and keeps the mask: looking whether it is needed would wait for the device.
         query, needed, rotation = self._constants(audio, mask) if prepared is None else prepared
         # F'_a: each frame of speech looks for the motion that belongs to it.

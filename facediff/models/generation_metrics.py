@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from torchmetrics import Metric
 from facediff.data import Batch, Clip, Sample, SpeechMotionDataModule, collate
 from facediff.data.batch import UNKNOWN_IDENTITY
 from facediff.data.dataset import MotionDataset
-from facediff.errors import FaceDiffError, counted
+from facediff.errors import FaceDiffError, counted, damaged
 from facediff.metrics import (
     MeanVertexError,
     MotionLiveliness,
@@ -38,6 +38,7 @@ from facediff.models.inference import named
 from facediff.models.scoring import ScoredCorpus
 from facediff.registry import name_of
 from facediff.utils import ranges
+from facediff.utils.ranges import Range
 
 REFERENCES = {
     "own": "own reference",
@@ -45,13 +46,13 @@ REFERENCES = {
     "another": "another speaker's reference",
     "another_other_mood": "another speaker's reference in another mood",
 }
-"""Whose reference gives the style. Moods are equal or not by the corpus's ``reference_attributes``."""
+"""The reference that gives the style. Moods are equal or not by the corpus's ``reference_attributes``."""
 
 LABELS = ("hidden", "known")
 """Whether the model is told who a trained speaker is."""
 
 CHANNEL_GROUPS = ("expression", "jaw", "head", "eyes")
-"""Groups of channels whose liveliness is measured."""
+"""Groups of channels of which liveliness is measured."""
 
 GENERATION_METRICS: dict[str, str] = {
     "liveliness_upper_face": "liveliness of the upper face (1)",
@@ -99,8 +100,8 @@ GENERATION_METRICS: dict[str, str] = {
     "param_mve": "MVE of channels, one sample",
     "real_time_factor": "real-time factor, one sample",
 }
-"""Names of the metrics in files, and their titles; in parentheses what the truth itself, or a model that draws
-from the truth's distribution, would get."""
+"""Names of the metrics in files, and their titles; in parentheses the score of the truth itself, or of a model that
+draws from the truth's distribution."""
 
 
 OF_EACH = {
@@ -122,7 +123,7 @@ OF_EACH = {
     "closed": "bilabial_closure_rate",
     "truly_closed": "bilabial_closure_rate:of=truth",
 }
-"""What is taken of each sample by itself, as metrics by name."""
+"""Metrics of each sample by itself, by name."""
 
 OF_SAMPLES = {
     "lve_mean": "mean_estimate_error",
@@ -135,7 +136,7 @@ OF_SAMPLES = {
     "variance_upper_face": "spread_error_ratio:region=upper_face,squared=true",
     "variance_lips": "spread_error_ratio:region=lips,squared=true",
 }
-"""What is taken of all samples of a clip together."""
+"""Metrics of all samples of a clip together."""
 
 NEAREST_SPEAKER = "nearest_speaker_accuracy:components=64"
 OF_OWN_REFERENCE = {"nearest_speaker": NEAREST_SPEAKER}
@@ -148,10 +149,10 @@ OF_BASELINES = {
     "mean_face": {"mean_face_lve": "lip_vertex_error"},
     "truth": {"true_nearest_speaker": NEAREST_SPEAKER},
 }
-"""What is taken of two faces that do not move, and of the truth itself."""
+"""Metrics of two faces that do not move, and of the truth itself."""
 
 NEEDED = {"nearest_speaker": ("gallery",), "blink_ratio": ("lid_pairs",), "closures": ("closures", "lip_pairs")}
-"""Metrics that a corpus may have no files for, and what they need."""
+"""Metrics for which a corpus may have no files, and the files."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ class SamplingOptions:
     """How a model is asked for motion.
 
     Attributes:
-        samples: of each clip.
+        samples: of each clip; the spread of a model needs two.
         references: samples of each clip with each reference.
         sampler: by name; the checkpoint's if None.
         steps: of the sampler; the sampler's own if None.
@@ -168,7 +169,7 @@ class SamplingOptions:
         low_latency: frame by frame, as speech arrives.
     """
 
-    samples: ranges.Samples = 10
+    samples: Annotated[int, Range(2, 1000)] = 10
     references: ranges.Samples = 2
     sampler: str | None = None
     steps: ranges.Steps | None = None
@@ -179,8 +180,6 @@ class SamplingOptions:
     def __post_init__(self) -> None:
         """Check the numbers."""
         ranges.check_options(self)
-        if self.samples < 2:
-            raise FaceDiffError(f"--samples {self.samples}: the spread of a model needs two samples; give 2 or more")
 
 
 class EvaluationCorpus(ScoredCorpus):
@@ -188,44 +187,46 @@ class EvaluationCorpus(ScoredCorpus):
 
     def __init__(self, data: SpeechMotionDataModule) -> None:
         compared, assets = data.compared_speakers, data.assets()
-        known = sorted(name for name in assets.templates if compared is None or name in compared)
-        super().__init__(data, assets, known)
+        speakers = sorted(name for name in assets.templates if compared is None or name in compared)
+        super().__init__(data, assets, speakers)
         tables = (OF_EACH, OF_SAMPLES, *OF_BASELINES.values(), OF_OWN_REFERENCE)
         self.needs = {need for table in tables for text in table.values() for need in parse(text).needs}
         context = self.context(self.needs, torch.device("cpu"))
         # Of a model without noise all samples are one.
-        self.given = replace(context, has={**context.has, "samples": {}})
-        lacking = [(name, need) for name, needs in NEEDED.items() for need in needs if need not in self.given.has]
-        self.missing = {name: self.given.missing[need] for name, need in lacking}
+        self.offered = replace(context, has={**context.has, "samples": {}})
+        lacking = [(name, need) for name, needs in NEEDED.items() for need in needs if need not in self.offered.has]
+        self.reasons = {name: self.offered.reasons[need] for name, need in lacking}
         self.channels = {name: region for name, region in context.channels.items() if name in CHANNEL_GROUPS}
 
     def metrics(self, table: Mapping[str, str], device: torch.device, **options: Any) -> dict[str, Metric]:  # noqa: ANN401
         """The metrics of a table that the corpus has all for, with further options."""
         requests = {name: parse(text) for name, text in table.items()}
         return {
-            name: replace(request, options={**request.options, **options}).build(self.given).to(device)
+            name: replace(request, options={**request.options, **options}).build(self.offered).to(device)
             for name, request in requests.items()
-            if set(request.needs) <= self.given.has.keys()
+            if set(request.needs) <= self.offered.has.keys()
         }
 
-    def references(self, clip: Clip, own: str) -> dict[str, Clip]:
-        """A clip's references by whose they are; ``own`` is the name of the usual one."""
+    def references(self, clip: Clip, template: str) -> dict[str, Clip]:
+        """A clip's references by their owner; ``template`` is the name of the usual one."""
         attributes = self.data.reference_attributes
         candidates = {
-            name: [other for other in clips if other.name != clip.name]
+            name: [candidate for candidate in clips if candidate.name != clip.name]
             for name, clips in self.data.reference_policy().candidates.items()
         }
         mine = candidates.get(clip.identity, [])
-        others = [other for name in self.speakers if name != clip.identity for other in candidates.get(name, [])]
+        of_others = [
+            candidate for name in self.speakers if name != clip.identity for candidate in candidates.get(name, [])
+        ]
 
-        def alike(other: Clip) -> bool:
-            return all(other.attributes.get(name) == clip.attributes.get(name) for name in attributes)
+        def alike(candidate: Clip) -> bool:
+            return all(candidate.attributes.get(name) == clip.attributes.get(name) for name in attributes)
 
         sorts = {
-            "own": [other for other in mine if other.name == own],
-            "own_other_mood": [other for other in mine if not alike(other)],
-            "another": [other for other in others if alike(other)],
-            "another_other_mood": [other for other in others if not alike(other)],
+            "own": [candidate for candidate in mine if candidate.name == template],
+            "own_other_mood": [candidate for candidate in mine if not alike(candidate)],
+            "another": [candidate for candidate in of_others if alike(candidate)],
+            "another_other_mood": [candidate for candidate in of_others if not alike(candidate)],
         }
         # By chance, but the same for every model: moods and speakers are met about equally often.
         return {
@@ -240,7 +241,7 @@ class Measurement:
 
     Args:
         model: a trained model in evaluation mode.
-        corpus: what it is measured on.
+        corpus: the clips that are measured.
         sampling: how it is asked for motion.
     """
 
@@ -277,13 +278,13 @@ class Measurement:
         """Generate motion for a clip, and score it."""
         batch, corpus = self.model.with_person_styles(collate([sample]).to(self.model.device)), self.corpus
         motion, truth = self._samples(batch)[None], batch.motion
-        for every, each in (("channel_samples", "channels"), ("samples", "each")):
-            if each == "each":  # of vertices, where a rig decodes them
+        for every, key in (("channel_samples", "channels"), ("samples", "each")):
+            if key == "each":  # of vertices, where a rig decodes them
                 motion, truth = (corpus.decoded(side, batch.identity_names) for side in (motion, truth))
             inputs = corpus.inputs(truth, truth, batch, corpus.needs)
             self._update(every, {**inputs, "samples": motion.expand(-1, self.compared, -1, -1, -1)})
-            for drawn in motion.unbind(1):
-                self._update(each, {**inputs, "prediction": drawn})
+            for one_sample in motion.unbind(1):
+                self._update(key, {**inputs, "prediction": one_sample})
         mean = corpus.decoded(corpus.mean_faces.of([clip.identity]).to(batch.motion)[:, None], [clip.identity])
         faces = {"still": torch.zeros_like(truth), "mean_face": mean.expand_as(truth), "truth": truth}
         for face, motion in faces.items():
@@ -313,11 +314,11 @@ class Measurement:
                 motion = corpus.decoded(self.model.generate(default, seed=seed), default.identity_names)
                 self._update("default_style", {"prediction": motion, "truth": truth[:1]})
             generated = corpus.decoded(self.model.generate(batch, seed=seed), names)
-            for place, name in enumerate(views):
-                self.metrics["references"][name].update(generated[place], truth[place])
+            for number, name in enumerate(views):
+                self.metrics["references"][name].update(generated[number], truth[number])
                 if name == "hidden_own":
                     numbers = corpus.numbers(batch)[:1]
-                    self._update("own_reference", {"prediction": generated[place], "identities": numbers})
+                    self._update("own_reference", {"prediction": generated[number], "identities": numbers})
 
     def _with_default_style(self, clip: Clip, sample: Sample) -> Batch | None:
         """A clip with the style that its identity has where none is named; None if it has none, or the clip itself."""
@@ -388,7 +389,7 @@ class GenerationScores:
     Attributes:
         corpus: name of the corpus.
         synthetic: whether a program made it.
-        checkpoints: what was measured.
+        checkpoints: the measured models.
         sampler: how motion was sampled, in words.
         samples: of each clip; 1 for a model without noise.
         speakers: among how many the nearest one was looked for; 0 if it was not.
@@ -441,7 +442,7 @@ class GenerationScores:
                 }
                 if self.against_name:
                     row |= {"against": against, "ratio": mean / against if mean is not None and against else None}
-                numbered = {f"value_{place}": value for place, value in enumerate(values[name], 1)}
+                numbered = {f"value_{number}": value for number, value in enumerate(values[name], 1)}
                 table.append(row | numbered)
         return table
 
@@ -462,18 +463,13 @@ FORMAT = "facediff generation metrics 1"
 def means_of(content: object, source: object) -> dict[str, dict[str, float | None]]:
     """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave."""
     means: dict[str, dict[str, float | None]] = {}
-    try:
-        if not isinstance(content, dict) or content["format"] != FORMAT:
-            raise TypeError
-        if not content["metrics"]:
-            raise ValueError
-        for row in content["metrics"]:
+    with damaged(source, "expected a file of `facediff generation-metrics --json`"):
+        rows: Any = content["metrics"] if content["format"] == FORMAT else []  # type: ignore[index]
+        if not rows:
+            raise ValueError("holds no generation metrics")
+        for row in rows:
             mean = row["mean"]
             means.setdefault(str(row["split"]), {})[str(row["metric"])] = None if mean is None else float(mean)
-    except (TypeError, KeyError, ValueError) as error:
-        raise FaceDiffError(
-            f"{source}: holds no generation metrics; expected a file of `facediff generation-metrics --json`"
-        ) from error
     return means
 
 
@@ -490,7 +486,7 @@ def measure(
 
     Args:
         models: what loads each model, by the name of its checkpoint; one is in memory at a time.
-        data: the corpus, whose folder is there.
+        data: the corpus, with its folder.
         splits: ``val``, ``test_a``, ``test_b``; all test splits if None.
         sampling: how they are asked for motion.
         most_clips: clips of a split, evenly spread; all if None.
@@ -499,12 +495,12 @@ def measure(
     sampling = sampling or SamplingOptions()
     corpus = EvaluationCorpus(data)
     datasets = {split: data.dataset(split) for split in splits or data.test_splits}
-    chosen = {split: picked(dataset, most_clips) for split, dataset in datasets.items()}
+    clips_of = {split: picked(dataset, most_clips) for split, dataset in datasets.items()}
     values: dict[str, dict[str, list[float | None]]] = {
         split: {name: [] for name in GENERATION_METRICS} for split in datasets
     }
     described: set[str] = set()
-    drawn = 1
+    n_samples = 1
     for name, load in models.items():
         model = load()
         if model.assets.identities != corpus.assets.identities or model.n_vertices != data.n_vertices:
@@ -521,33 +517,33 @@ def measure(
         described.add(sampler_of(model))
         for split, dataset in datasets.items():
             measurement = Measurement(model, corpus, sampling)
-            measurement.warm_up(dataset[chosen[split][0]])
-            for place in chosen[split]:
-                measurement.add(dataset.clips[place], dataset[place])
+            measurement.warm_up(dataset[clips_of[split][0]])
+            for clip_index in clips_of[split]:
+                measurement.add(dataset.clips[clip_index], dataset[clip_index])
                 step()
             for metric, value in measurement.result().items():
                 values[split][metric].append(value)
-            drawn = measurement.drawn
-    gallery = corpus.given.has.get("gallery")
+            n_samples = measurement.drawn
+    gallery = corpus.offered.has.get("gallery")
     return GenerationScores(
         corpus=corpus.assets.corpus,
         synthetic=corpus.assets.synthetic,
         checkpoints=list(models),
         sampler=", ".join(sorted(described)),
-        samples=drawn,
+        samples=n_samples,
         speakers=len({*gallery["gallery"].speakers}) if gallery else 0,
-        clips={split: len(places) for split, places in chosen.items()},
+        clips={split: len(indices) for split, indices in clips_of.items()},
         values=values,
-        missing=corpus.missing,
+        missing=corpus.reasons,
     )
 
 
-def picked(dataset: MotionDataset, most: int | None) -> list[int]:
-    """The clips that are measured: all, or at most ``most``, evenly spread."""
+def picked(dataset: MotionDataset, limit: int | None) -> list[int]:
+    """The clips that are measured: all, or at most ``limit``, evenly spread."""
     count = len(dataset)
-    if most is None or count <= most:
+    if limit is None or count <= limit:
         return list(range(count))
-    return [math.floor(place * count / most) for place in range(most)]
+    return [math.floor(number * count / limit) for number in range(limit)]
 
 
 def sampler_of(model: AnimationModel) -> str:
@@ -558,7 +554,7 @@ def sampler_of(model: AnimationModel) -> str:
     if sampler is None:
         return type(model).__name__
     description = f"{name_of(type(sampler))} with {counted(sampler.steps, 'step')}"
-    own = model.expressivity
-    if isinstance(own, Tensor):
+    expressivity = model.expressivity
+    if isinstance(expressivity, Tensor):
         return f"{description}, expressivity by vertex"
-    return description if own == 1 else f"{description}, expressivity {own:g}"
+    return description if expressivity == 1 else f"{description}, expressivity {expressivity:g}"

@@ -4,7 +4,7 @@ Every exported model has a graph ``speech``, which encodes speech, and a graph `
 that generates all frames in one pass (``direct``) has nothing else. One that samples has ``step`` between them, which
 predicts clean motion from noisy motion once; the loop over the steps is a table of numbers (:func:`update_table`),
 since every linear sampler is one. The loop is left out of the graphs on purpose: recording ten steps one after the
-other takes ten times as long, and the file would hold the network ten times. What is constant goes along as plain
+other takes ten times as long, and the file would hold the network ten times. Constants go along as plain
 numbers.
 
 Here is what all models share; each method has its own graphs next to its network.
@@ -35,7 +35,7 @@ BATCH: Axes = {0: "batch"}
 FRAMES: Axes = {0: "batch", 1: "frames"}
 
 StyleSource = Literal["reference", "identity", "none"]
-"""What a style is: a vector of a reference motion, a training identity, or nothing that the model knows."""
+"""Kind of style: a vector of a reference motion, a training identity, or nothing that the model knows."""
 
 Blending = Literal["steps", "motion"]
 """Where overlapping windows of long speech are blended: in every denoising step, or in the motion."""
@@ -65,7 +65,7 @@ class Graph:
 
 @dataclass(frozen=True)
 class SamplingLoop:
-    """What is done with the graph ``step``.
+    """The loop over the graph ``step``.
 
     Attributes:
         state: numbers in a frame of noisy motion.
@@ -75,7 +75,7 @@ class SamplingLoop:
         steps: the diffusion steps that are visited.
         table: for each of them, the numbers of :func:`update_table`.
         last_step: the step at which only the mean is left; −1 where the model predicts none.
-        decoded: what the last graph decodes: the ``sample``, or the ``kept`` numbers of the last step.
+        decoded: input of the last graph: the ``sample``, or the ``kept`` numbers of the last step.
         noise: what unit noise is multiplied by before use, (state, state); None for nothing.
         noise_of: what noise depends on.
         quick_steps: the steps that are visited at low latency; see
@@ -98,7 +98,7 @@ class SamplingLoop:
 
 
 NO_LOOP = SamplingLoop(0, 0, 0, "", [], [], -1, "sample", None, "clip")
-"""What is said of the loop of a model that has none."""
+"""The loop of a model that has none."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,9 @@ class Graphs:
             reference motions of a batch always must.
         blending: how windows of long speech are joined.
         clock: how the model counts its frames.
-        style: what a style is.
+        style: kind of style.
         epsilon: added to the variance of speech before it is standardised.
-        longest: frames at most of what is animated in one pass; 0 for any number.
+        longest: frames at most in one pass; 0 for any number.
         sampling: of a model that samples.
     """
 
@@ -150,11 +150,11 @@ def update_table(sampler: Sampler) -> list[list[float]]:
         count = min(i + 1, sampler.memory)
         row = []
         # A linear function is determined by its values at the unit vectors.
-        for place in range(5):
-            noisy, *predictions = (one if place == unit else zero for unit in range(4))
-            drawn = one if place == 4 else zero
+        for column in range(5):
+            noisy, *predictions = (one if column == unit else zero for unit in range(4))
+            random_part = one if column == 4 else zero
             latest = predictions[:count][::-1]
-            row.append(float(sampler.update(i, noisy, latest, lambda like, drawn=drawn: drawn)))  # type: ignore[misc]
+            row.append(float(sampler.update(i, noisy, latest, lambda like, random_part=random_part: random_part)))  # type: ignore[misc]
         table.append(row)
     if sampler.spread != 1 and sampler.steps > 1:
         table[0][0] *= sampler.spread
@@ -180,10 +180,10 @@ class Speech:
     cached_features: None = None
 
 
-Spoken = Batch | Speech
+SpeechInput = Batch | Speech
 """Where speech is found."""
 
-Hear = Callable[[Speech, Int[Tensor, " batch"], int], Tensor]
+SpeechEncoding = Callable[[Speech, Int[Tensor, " batch"], int], Tensor]
 """Features of speech for a number of frames of each clip, and the largest of these numbers."""
 
 
@@ -219,7 +219,7 @@ class ModelPart(nn.Module, Generic[ModelType]):
     """A part of a model as a module by itself, to become a graph.
 
     Args:
-        model: whose parameters are used.
+        model: gives the parameters.
     """
 
     def __init__(self, model: ModelType) -> None:
@@ -231,14 +231,14 @@ class SpeechGraph(ModelPart[GraphedModel]):
     """Speech to one feature per frame of motion.
 
     Args:
-        model: whose parameters are used.
-        hear: makes the features.
+        model: gives the parameters.
+        encode: makes the features.
         steps_of: from a number of frames to the audio encoder's steps.
     """
 
-    def __init__(self, model: GraphedModel, hear: Hear, steps_of: Callable[[int], int]) -> None:
+    def __init__(self, model: GraphedModel, encode: SpeechEncoding, steps_of: Callable[[int], int]) -> None:
         super().__init__(model)
-        self.hear = hear
+        self.encode = encode
         self.steps_of = steps_of
 
     def forward(
@@ -260,7 +260,7 @@ class SpeechGraph(ModelPart[GraphedModel]):
         """
         level = self.model.speech_encoder.at_level(mean[:, None], deviation[:, None])
         with level, of_frames(self.steps_of(mask.shape[1])):
-            return self.hear(Speech(audio, samples), mask.sum(1), mask.shape[1])
+            return self.encode(Speech(audio, samples), mask.sum(1), mask.shape[1])
 
 
 def one_each(frames: int) -> int:
@@ -268,13 +268,13 @@ def one_each(frames: int) -> int:
     return frames
 
 
-def speech_graph(model: GraphedModel, hear: Hear, steps_of: Callable[[int], int] = one_each) -> Graph:
+def speech_graph(model: GraphedModel, encode: SpeechEncoding, steps_of: Callable[[int], int] = one_each) -> Graph:
     """The graph of the audio encoder; see :class:`SpeechGraph` for the arguments."""
     batch, samples = 2, 32_000
     frames = model.clock.frames(samples)
     return Graph(
         "speech",
-        SpeechGraph(model, hear, steps_of),
+        SpeechGraph(model, encode, steps_of),
         {
             "audio": torch.randn(batch, samples, generator=torch.Generator().manual_seed(0)),
             "mean": torch.zeros(batch),
@@ -312,6 +312,6 @@ def style_graphs(model: GraphedModel, width: int) -> list[Graph]:
 
 
 def results_of(graph: Graph) -> Any:  # noqa: ANN401 - a tensor, or a tuple of them
-    """What a graph makes of its example values; what follows from weights alone is a constant of it from then on."""
+    """A graph's results for its example values; values that follow from weights alone become constants of it."""
     with torch.no_grad():
         return graph.module.eval()(*graph.inputs.values())

@@ -1,8 +1,8 @@
-"""What a trained model does with speech: whole clips, several samples of one clip, sliding windows and streams.
+"""Inference of a trained model: whole clips, several samples of one clip, sliding windows and streams.
 
 From top to bottom: :class:`Inference`, the methods that every model has; how long speech is cut into windows
-(:class:`WindowPlan`) and animated window by window while it arrives (:class:`SpeechStream`); and what a model that
-samples needs for that: noise that belongs to a clip or a window, and the blend of windows where they overlap.
+(:class:`WindowPlan`) and animated window by window while it arrives (:class:`SpeechStream`); and, for a model that
+samples, noise that belongs to a clip or a window, and the blend of windows where they overlap.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Style:
 
 
 def named(style: Reference | Style) -> str:
-    """The name of a style, of a reference that of its clip."""
+    """The name of a style; a reference has its clip's name."""
     return style.name if isinstance(style, Style) else style.clip
 
 
@@ -81,26 +81,26 @@ class Inference(ABC):
     """The part of a model that animates.
 
     A model says how it generates whole clips (:meth:`generate_clips`); the rest follows. A model that samples also says
-    how several samples of a clip share what they can (:meth:`generate_samples`), and how a window of long speech
+    how several samples of a clip share computations (:meth:`generate_samples`), and how a window of long speech
     continues the one before it (:meth:`generate_window`).
 
     Class attributes:
         samples: whether motion depends on random noise, by a sampler that :meth:`choose_sampler` changes.
-        hears_all: whether the model counts its frames by itself (:attr:`clock`) and encodes all samples of a
+        counts_own_frames: whether the model counts its frames by itself (:attr:`clock`) and encodes all samples of a
             recording; else speech is cut or filled up to whole frames.
-        hears_whole_clips: whether training encodes a clip's speech as a whole, so that its features can be kept.
+        encodes_whole_clips: whether training encodes a clip's speech as a whole, so that its features can be kept.
         chosen: attributes that the methods ``choose_…`` change, and :meth:`choosing` restores.
 
     Attributes:
         frame_rate: motion frames a second.
         windows: how speech is cut that is too long for one pass; may be changed at any time.
         expressivity: how far motion goes from the mean prediction to a sample, see :meth:`choose_expressivity`.
-        low_latency_steps: denoising steps at low latency; None for a model whose steps do not change then.
+        low_latency_steps: denoising steps at low latency; None for a model with the same steps then.
     """
 
     samples: ClassVar[bool] = False
-    hears_whole_clips: ClassVar[bool] = True
-    hears_all: ClassVar[bool] = False
+    encodes_whole_clips: ClassVar[bool] = True
+    counts_own_frames: ClassVar[bool] = False
     chosen: ClassVar[tuple[str, ...]] = ("windows", "expressivity")
     frame_rate: float
     windows: WindowPlan
@@ -122,8 +122,8 @@ class Inference(ABC):
 
         Args:
             audio: speech at 16 kHz.
-            identity: whose face and identity; any speaker of the training corpus, also one not trained on.
-            condition: the training identity that the model is conditioned on, where it is not that of the face.
+            identity: the speaker of face and identity; any speaker of the training corpus, also one not trained on.
+            condition: the training identity that the model is conditioned on, where it is not the face's.
             style: reference motion, or a style vector made by this model; the speaker's default one if None.
             seed: seed of the noise; equal seeds give equal motion on one machine.
             expressivity: as :meth:`choose_expressivity` takes it, for this call alone; the model's own if None.
@@ -157,17 +157,7 @@ class Inference(ABC):
         expressivity: Expressivity | None = None,
         progress: Progress | None = None,
     ) -> list[Prediction]:
-        """Several samples for the same speech, one for each seed; the speech is encoded once.
-
-        Args:
-            audio: speech at 16 kHz.
-            identity: as :meth:`animate` takes it.
-            condition: as :meth:`animate` takes it.
-            style: as :meth:`animate` takes it.
-            seeds: one for each sample.
-            expressivity: as :meth:`animate` takes it.
-            progress: as :meth:`animate` takes it.
-        """
+        """Several samples for the same speech, one for each seed; the speech is encoded once."""
         clip = self.clip_of(audio, identity, style, condition)
         with self.expressed(expressivity):
             motions = self.sample_clip(clip, seeds, progress=progress)
@@ -178,13 +168,7 @@ class Inference(ABC):
         ]
 
     def sample_clip(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> Motion:
-        """Several samples of one clip of any length.
-
-        Args:
-            clip: a batch of one clip; ``motion`` gives the number of frames only.
-            seeds: one for each sample.
-            progress: as :meth:`animate` takes it.
-        """
+        """Several samples of one clip of any length."""
         frames = clip.motion.shape[1]
         # Long speech is a stream that happens to be known: the same windows, the same noise, the same motion.
         if self.windows.in_one_pass(frames, self.frame_rate):
@@ -208,15 +192,9 @@ class Inference(ABC):
         plan: WindowPlan | None = None,
         expressivity: Expressivity | None = None,
     ) -> SpeechStream:
-        """Animate speech of any length while it arrives.
+        """Animate speech of any length while it arrives, with the options of :meth:`animate`.
 
-        Args:
-            identity: as :meth:`animate` takes it.
-            condition: as :meth:`animate` takes it.
-            style: as :meth:`animate` takes it.
-            seeds: one for each sample.
-            plan: how speech is cut; shorter windows give frames sooner. :attr:`windows` if None.
-            expressivity: as :meth:`animate` takes it.
+        ``plan`` says how speech is cut, :attr:`windows` if None; shorter windows give frames sooner.
         """
         # The speech is not known yet; a clip of one silent frame carries the face and the style.
         frame = torch.zeros(samples_for(1, self.frame_rate), device=self.device)
@@ -235,12 +213,6 @@ class Inference(ABC):
         """Motion for the batch's speech, identity and reference; its true motion is not used.
 
         Clips that last longer than ``windows.above`` are generated by windows, all others in one pass.
-
-        Args:
-            batch: clips; ``motion`` gives the number of frames only.
-            seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the other clips.
-            expressivity: as :meth:`animate` takes it.
-            progress: wraps the iteration over steps, or over the seconds of long speech, e.g. in a progress bar.
         """
         with self.expressed(expressivity):
             return self._generate(batch, seed, progress)
@@ -248,16 +220,16 @@ class Inference(ABC):
     def _generate(self, batch: Batch, seed: int, progress: Progress | None) -> BatchMotion:
         """Short clips together, each long one by windows."""
         lengths = batch.frame_lengths.tolist()
-        short = [i for i, frames in enumerate(lengths) if self.windows.in_one_pass(frames, self.frame_rate)]
-        if len(short) == len(lengths):
+        one_pass = [i for i, frames in enumerate(lengths) if self.windows.in_one_pass(frames, self.frame_rate)]
+        if len(one_pass) == len(lengths):
             return self.generate_clips(batch, seed=seed, progress=progress)
         motion = torch.zeros_like(batch.motion)
         with torch.no_grad():
-            if short:
-                together = self.generate_clips(batch.select(short), seed=seed)
-                motion[short, : together.shape[1]] = together
+            if one_pass:
+                together = self.generate_clips(batch.select(one_pass), seed=seed)
+                motion[one_pass, : together.shape[1]] = together
             # One by one: windows continue each other, and clips of different lengths would leave rows of a batch idle.
-            for i in sorted({*range(len(lengths))} - {*short}):
+            for i in sorted({*range(len(lengths))} - {*one_pass}):
                 clip, start = batch.select([i]), 0
                 speech = clip.audio[0, : int(clip.audio_lengths[0])]
                 stream = SpeechStream(self, clip, seeds=[seed])
@@ -290,30 +262,17 @@ class Inference(ABC):
         condition: str | None = None,
         frames: int | None = None,
     ) -> Batch:
-        """Speech, a face and a style as a batch of one clip on the model's device; its motion is zero.
-
-        Args:
-            audio: speech at 16 kHz.
-            identity: as :meth:`animate` takes it.
-            style: as :meth:`animate` takes it.
-            condition: as :meth:`animate` takes it.
-            frames: how many the speech lasts; as :meth:`frames_of` counts them if None.
-        """
+        """Speech, a face and a style as a batch of one clip on the model's device; its motion is zero."""
         template = self.assets.template(identity)
         self.check_condition(condition)
         style = style or self.default_style(identity)
-        # A style vector bypasses the style encoder, whose reference is then a single frame without effect.
+        # A style vector bypasses the style encoder; its reference is then a single frame without effect.
         nothing = template.new_zeros(1, *template.shape)
         reference = style if isinstance(style, Reference) else Reference(style.name, nothing)
-        if reference.motion.shape[1:] != template.shape:
-            raise FaceDiffError(
-                f"style: the reference {reference.clip} has {reference.motion.shape[1]} vertices, the checkpoint's "
-                f"faces have {len(template)}; give a motion of the same topology"
-            )
         frames = self.frames_of(len(audio)) if frames is None else frames
         if frames < 1:
             raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
-        length = len(audio) if self.hears_all else samples_for(frames, self.frame_rate)
+        length = len(audio) if self.counts_own_frames else samples_for(frames, self.frame_rate)
         sample = Sample(
             audio=torch.nn.functional.pad(audio[:length], (0, max(0, length - len(audio)))),
             motion=torch.zeros(frames, *template.shape),
@@ -342,16 +301,11 @@ class Inference(ABC):
         return True
 
     def own_styles(self) -> dict[str, Style]:
-        """Styles that the model has by name, in addition to those of reference motion, for ``--style``; here none."""
+        """Styles that the model has by name, in addition to reference motion, for ``--style``; here none."""
         return {}
 
     def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
-        """Change the sampler for all that follows; a model that does not sample has none.
-
-        Args:
-            name: the sampler's registered name; the present one if None.
-            steps: its denoising steps; its own default if None.
-        """
+        """Change the sampler for all that follows; a model that does not sample has none."""
         how = "samples in its own way only" if self.samples else "does not sample"
         raise OptionError.naming(f"{type(self).__name__} {how}: omit {{sampler}} and {{steps}}")
 
@@ -366,7 +320,7 @@ class Inference(ABC):
     def choose_expressivity(self, expressivity: Expressivity) -> None:
         """Go from the mean prediction (0) to a full sample (1) or beyond, for all that follows.
 
-        Motion is mean + expressivity · (sample − mean). The mean is what speech, identity and style determine; what
+        Motion is mean + expressivity · (sample − mean). Speech, identity and style determine the mean; the part that
         they leave open, a sample draws at random.
 
         Args:
@@ -375,7 +329,7 @@ class Inference(ABC):
         if not isinstance(expressivity, Tensor) and expressivity == 1:
             return
         raise FaceDiffError(
-            f"expressivity: {type(self).__name__} makes one animation and no samples around a mean; omit the option"
+            f"expressivity: {type(self).__name__} predicts no mean around which samples lie; omit the option"
         )
 
     @contextmanager
@@ -391,24 +345,16 @@ class Inference(ABC):
                 self.expressivity = before
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
-        """Follow some conditions more than the model would by itself, for all that follows.
-
-        Args:
-            scales: by condition; 1 follows it as the model has learnt to.
-        """
+        """Follow some conditions more than the model would by itself, for all that follows."""
         raise FaceDiffError(f"guidance: {type(self).__name__} cannot be guided; omit the option")
 
     def choices(self) -> dict[str, object]:
-        """What has been chosen for inference: windows, expressivity, and whatever else the model offers."""
+        """The choices for inference: windows, expressivity, and further ones of the model."""
         return {name: vars(self)[name] for name in self.chosen if name in vars(self)}
 
     @contextmanager
     def choosing(self, choices: Mapping[str, object] | None = None) -> Iterator[None]:
-        """Within it, earlier :meth:`choices` hold; whatever is chosen in it is forgotten at its end.
-
-        Args:
-            choices: those to begin with; the present ones if None.
-        """
+        """Within it, earlier :meth:`choices` hold; choices in it are forgotten at its end."""
         before = self.choices()
         self._restore(before if choices is None else choices)
         try:
@@ -427,13 +373,7 @@ class Inference(ABC):
 
     @abstractmethod
     def generate_clips(self, batch: Batch, *, seed: int = 0, progress: Progress | None = None) -> BatchMotion:
-        """Motion of whole clips in one pass; memory may grow with the square of their length.
-
-        Args:
-            batch: clips; ``motion`` gives the number of frames only.
-            seed: seed of the noise; a clip's noise depends on it and on the clip's name, not on the other clips.
-            progress: wraps the iteration over steps, e.g. in a progress bar.
-        """
+        """Motion of whole clips in one pass; memory may grow with the square of their length."""
 
     def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> Motion:
         """Several samples for one clip, which share what does not depend on the seed.
@@ -453,15 +393,15 @@ class Inference(ABC):
             clip: one clip with the window's speech, and some before and after it.
             window: which of its frames are returned.
             seeds: one for each sample.
-            before: what the window before handed over; None for the first.
+            before: the window before's result to continue from; None for the first.
 
         Returns:
             the motion, and what to hand over to the next window.
         """
-        whole = self.generate_samples(clip, seeds)
+        samples = self.generate_samples(clip, seeds)
         # The past was animated only so that the network knows it; frames that were given out already must not change
         # any more.
-        motion = whole[:, window.context + window.fixed : window.context + window.frames]
+        motion = samples[:, window.context + window.fixed : window.context + window.frames]
         if before is not None:
             motion = crossfaded(before[0], motion)
         return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
@@ -493,12 +433,7 @@ class Inference(ABC):
     def encode_style(
         self, reference: BatchMotion, mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
-        """Style vectors of reference motions, as a batch's ``style`` takes them.
-
-        Args:
-            reference: offsets from the template.
-            mask: True on valid frames.
-        """
+        """Style vectors of reference motions, as a batch's ``style`` takes them."""
 
 
 # Streams: speech of any length, window by window while it arrives.
@@ -624,7 +559,7 @@ class WindowNoise:
 
     def _draw(self, streams: Sequence[torch.Generator], index: int, like: Tensor) -> Tensor:
         """Noise of the frames that are new in a window of an index."""
-        # Those of a full window also where the speech ends earlier: its end must not change the noise of its frames.
+        # Noise of a full window also where the speech ends earlier: its end must not change the noise of its frames.
         shape = (self.window.plan.hop if index else self.window.plan.frames, like.shape[2])
         return torch.stack([torch.randn(shape, device=like.device, dtype=like.dtype, generator=s) for s in streams])
 
@@ -641,7 +576,7 @@ class WindowOverlap:
         fixed: shared frames at the start that are given out already.
 
     Attributes:
-        features: those of the kept frames, one tensor for each step; the next window's ``before``.
+        features: features of the kept frames, one tensor for each step; the next window's ``before``.
     """
 
     def __init__(self, before: Sequence[Tensor] | None, kept: slice, fixed: int = 0) -> None:
@@ -663,15 +598,15 @@ class WindowOverlap:
 
 
 def crossfaded(
-    before: Float[Tensor, "seeds shared *rest"], now: Float[Tensor, "seeds frames *rest"], fixed: int = 0
+    before: Float[Tensor, "seeds shared *rest"], after: Float[Tensor, "seeds frames *rest"], fixed: int = 0
 ) -> Float[Tensor, "seeds frames *rest"]:
-    """Go over from what a window had in the shared frames to what the next one has there.
+    """Fade from a window's frames to the next window's in the frames that they share.
 
     The new window's share is 0 in the ``fixed`` first frames and in the shared one behind them, which is the old
     window's alone, and would be 1 behind the last; it is smooth at both.
     """
     shared = before.shape[1]
-    share = (torch.arange(shared, device=now.device, dtype=now.dtype) - fixed).clamp_min(0) / max(1, shared - fixed)
+    share = (torch.arange(shared, device=after.device, dtype=after.dtype) - fixed).clamp_min(0) / max(1, shared - fixed)
     # Smoothstep: its slope is 0 at both ends, so that velocities have no jump where windows meet.
-    smooth = (share * share * (3 - 2 * share)).view(-1, *[1] * (now.dim() - 2))
-    return torch.cat([torch.lerp(before, now[:, :shared], smooth), now[:, shared:]], 1)
+    smooth = (share * share * (3 - 2 * share)).view(-1, *[1] * (after.dim() - 2))
+    return torch.cat([torch.lerp(before, after[:, :shared], smooth), after[:, shared:]], 1)

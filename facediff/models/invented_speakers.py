@@ -23,7 +23,7 @@ class InventedSpeakers(nn.Module):
     stranger with one of them. Here all of a clip's motion is multiplied by one random gain and each of its principal
     components by another, its style reference gets the very same gains, and the identity is hidden: how wide this
     speaker opens the jaw or raises the brows can be told from the reference only. Timing, and the shapes of movements,
-    stay those of the speaker.
+    stay the speaker's.
 
     Args:
         n_vertices: points.
@@ -46,28 +46,28 @@ class InventedSpeakers(nn.Module):
             scale: from these to the offsets that the principal components were taken of.
         """
         device = batch.motion.device
-        chosen = torch.rand(len(batch), device=device) < self.share
-        if not chosen.any():
+        drawn_clips = torch.rand(len(batch), device=device) < self.share
+        if not drawn_clips.any():
             return batch
-        clips = int(chosen.sum())
+        clips = int(drawn_clips.sum())
         every = (torch.randn(clips, 1, device=device) * self.deviation).exp()
-        own = (torch.randn(clips, COMPONENTS, device=device) * self.deviation / 2).exp()
+        factors = (torch.randn(clips, COMPONENTS, device=device) * self.deviation / 2).exp()
         changed = {name: getattr(batch, name).clone() for name in ("motion", "reference")}
         for motion in changed.values():
-            motion[chosen] = self.changed(motion[chosen] * scale, every, own) / scale
-        kept = zip(batch.identity_names, chosen.tolist(), strict=True)
+            motion[drawn_clips] = self.changed(motion[drawn_clips] * scale, every, factors) / scale
+        names = zip(batch.identity_names, drawn_clips.tolist(), strict=True)
         return replace(
             batch,
             **changed,
-            identity=batch.identity.masked_fill(chosen, UNKNOWN_IDENTITY),
-            identity_names=[f"invented {place}" if new else name for place, (name, new) in enumerate(kept)],
+            identity=batch.identity.masked_fill(drawn_clips, UNKNOWN_IDENTITY),
+            identity_names=[f"invented {number}" if new else name for number, (name, new) in enumerate(names)],
         )
 
     def changed(
         self,
         motion: Float[Tensor, "clips frames points dims"],
         every: Float[Tensor, "clips 1"],
-        own: Float[Tensor, "clips components"],
+        factors: Float[Tensor, "clips components"],
     ) -> Float[Tensor, "clips frames points dims"]:
         """Scaled motion with one gain on all of it and one on each of its principal components.
 
@@ -75,5 +75,5 @@ class InventedSpeakers(nn.Module):
         """
         mean = self.components.mean.view(-1, self.components.dims)
         amounts = self.components.project(motion)
-        moved = motion + self.components.expand(amounts * (own - 1)[:, None]) - mean
+        moved = motion + self.components.expand(amounts * (factors - 1)[:, None]) - mean
         return mean + every[:, :, None, None] * (moved - mean)

@@ -34,10 +34,23 @@ Share = Annotated[float, Range(0, 1)]
 """A probability, such as dropout's."""
 
 Weight = Annotated[float, Range(0, 1e6)]
-"""What a loss term is multiplied by."""
+"""Factor of a loss term."""
 
 Rotation = tuple[Tensor, Tensor]
 """Cosines and signed sines of a rotary embedding, both (frames, head_dim)."""
+
+
+def check_heads(*, even: bool = False, rotary: bool = False, **options: int) -> None:
+    """Refuse a width that its attention heads do not divide.
+
+    Args:
+        even: whether sines and cosines take half of the width each.
+        rotary: whether they take half of every head's channels each.
+        options: the width and the number of heads, by the names of their options.
+    """
+    (name, width), (heads, count) = options.items()
+    if width % (2 * count if rotary else count) or (even and width % 2):
+        raise ArgumentError(options, f"{name} must be a multiple of {'2 ' * rotary}{heads}{', and even' * even}")
 
 
 class AttentionContext(NamedTuple):
@@ -61,12 +74,12 @@ _most_frames: ContextVar[int | None] = ContextVar("most_frames", default=None)
 
 
 @contextmanager
-def of_frames(most: int) -> Iterator[None]:
+def of_frames(count: int) -> Iterator[None]:
     """Within it, the longest clip has so many frames, or steps of the audio encoder; see :func:`longest`.
 
     A graph takes the number from the shape of an input, since it cannot depend on values.
     """
-    token = _most_frames.set(most)
+    token = _most_frames.set(count)
     try:
         yield
     finally:
@@ -74,9 +87,9 @@ def of_frames(most: int) -> Iterator[None]:
 
 
 def longest(lengths: Int[Tensor, " batch"]) -> int:
-    """The largest of some lengths; while a graph is recorded, what :func:`of_frames` says."""
-    most = _most_frames.get()
-    return int(lengths.max()) if most is None else most
+    """The largest of some lengths; while a graph is recorded, the number that :func:`of_frames` sets."""
+    count = _most_frames.get()
+    return int(lengths.max()) if count is None else count
 
 
 def sliding(
@@ -84,8 +97,8 @@ def sliding(
 ) -> Float[Tensor, "batch count channels size"]:
     """So many windows over time, each ``stride`` steps after the one before; the last must end within the steps."""
     if exporting():  # graphs know no strided views
-        places = torch.arange(count, device=x.device)[:, None] * stride + torch.arange(size, device=x.device)
-        return x[:, places].transpose(2, 3)
+        indices = torch.arange(count, device=x.device)[:, None] * stride + torch.arange(size, device=x.device)
+        return x[:, indices].transpose(2, 3)
     return x.unfold(1, size, stride)[:, :count]
 
 
@@ -185,28 +198,21 @@ class RotaryEmbedding(nn.Module):
 
     def __init__(self, head_dim: int, base: float = 10_000.0) -> None:
         super().__init__()
-        if head_dim % 2:
-            raise ArgumentError({"head_dim": head_dim}, "rotary positions need an even number of channels per head")
         exponent = torch.arange(0, head_dim, 2, dtype=torch.float32) / head_dim
         # Not saved: it follows from the options, so a checkpoint need not repeat it.
         self.register_buffer("frequencies", base**-exponent, persistent=False)
 
     def table(self, frames: int) -> Rotation:
         """What :meth:`forward` needs for ``frames`` frames or fewer."""
-        places = torch.arange(frames, device=self.frequencies.device, dtype=torch.float32)
-        angle = places[:, None] * self.frequencies
+        positions = torch.arange(frames, device=self.frequencies.device, dtype=torch.float32)
+        angle = positions[:, None] * self.frequencies
         cos, sin = angle.cos(), angle.sin()
         return torch.cat([cos, cos], dim=-1), torch.cat([-sin, sin], dim=-1)
 
     def forward(
         self, x: Float[Tensor, "batch heads frames head_dim"], table: Rotation | None = None
     ) -> Float[Tensor, "batch heads frames head_dim"]:
-        """Rotate channel pair (i, i + head_dim/2) of frame t by t·frequency_i.
-
-        Args:
-            x: queries or keys.
-            table: as :meth:`table` gives it, of a rotary embedding like this one; computed if None.
-        """
+        """Rotate channel pair (i, i + head_dim/2) of frame t by t·frequency_i."""
         frames = x.shape[-2]
         cos, sin = (part[:frames].to(x.dtype) for part in (self.table(frames) if table is None else table))
         # (a, b) → (a cos − b sin, b cos + a sin): the halves change places, and the table's sines carry the signs.
@@ -234,12 +240,7 @@ class Attention(nn.Module):
         self, dim: int, context_dim: int, num_heads: int, *, rotary: bool = False, dropout: float = 0.0
     ) -> None:
         super().__init__()
-        if dim % num_heads:
-            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be a multiple of the number of heads")
-        if rotary and dim // num_heads % 2:
-            raise ArgumentError(
-                {"dim": dim, "num_heads": num_heads}, "rotary positions need dim / num_heads to be even"
-            )
+        check_heads(dim=dim, num_heads=num_heads, rotary=rotary)
         self.num_heads = num_heads
         self.dropout = dropout
         self.query = nn.Linear(dim, dim)
@@ -254,14 +255,7 @@ class Attention(nn.Module):
         context_mask: Bool[Tensor, "batch keys"] | None = None,
         rotation: Rotation | None = None,
     ) -> Frames:
-        """Attend from ``x`` to the valid positions of ``context``.
-
-        Args:
-            x: source of the queries.
-            context: source of the keys and values.
-            context_mask: True on valid positions; all are if None.
-            rotation: as :meth:`rotation` gives it; computed if None.
-        """
+        """Attend from ``x`` to the valid positions of ``context``."""
         return self.attend(self.queries(x, rotation), self.keys_values(context, rotation), context_mask)
 
     def rotation(self, frames: int) -> Rotation | None:

@@ -21,7 +21,7 @@ def load_model(path: Path | str, device: str = "cpu", *, commercial_only: bool =
         path: a checkpoint of any model, also of an installed package's; a model folder; or ``user/name[@revision]`` of
             the Hugging Face hub, where no such path exists.
         device: where it computes.
-        commercial_only: refuse a model whose licence labels do not allow commercial use.
+        commercial_only: refuse a model if its licence labels do not allow commercial use.
 
     Example:
         >>> model = load_model("demo/puppet.ckpt")  # doctest: +SKIP
@@ -35,12 +35,7 @@ def load_model(path: Path | str, device: str = "cpu", *, commercial_only: bool =
 
 
 def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
-    """The model of a checkpoint that :func:`read_checkpoint` has read, ready for inference on the CPU.
-
-    Args:
-        path: the file, for messages.
-        checkpoint: its content.
-    """
+    """The model of a checkpoint that :func:`read_checkpoint` has read, ready for inference on the CPU."""
     weights = checkpoint["state_dict"]
     # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
     # before the weights, since tables of mesh encoders are among these.
@@ -58,7 +53,7 @@ def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
 
 
 def check_styles(model: AnimationModel) -> None:
-    """Refuse styles of speakers that are not as long as those of the model, of which one number would fill all."""
+    """Refuse styles of speakers that are not as long as the model's; a single number would fill all."""
     lengths = {len(style.vector) for style in model.person_styles.values()}
     if not lengths:
         return

@@ -57,8 +57,8 @@ def reconstruction_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar
 def velocity_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
     """L_vel: Huber loss of the first differences over time (eq. 17); 0 for a single frame."""
     # A difference exists only between two valid frames: the one over a clip's end would compare motion with padding.
-    both = mask[:, 1:] & mask[:, :-1]
-    return huber(prediction.diff(dim=1), truth.diff(dim=1), both)
+    pairs = mask[:, 1:] & mask[:, :-1]
+    return huber(prediction.diff(dim=1), truth.diff(dim=1), pairs)
 
 
 def acceleration_loss(prediction: Motion, truth: Motion, mask: Mask) -> Scalar:
@@ -73,12 +73,6 @@ def face_dynamics_loss(prediction: Motion, truth: Motion, mask: Mask, region: In
     """L_face: mean over upper-face vertices of |σ − σ̂| (eq. 19).
 
     σ is the standard deviation over time of the length of a vertex's displacement.
-
-    Args:
-        prediction: predicted motion.
-        truth: true motion.
-        mask: valid frames.
-        region: indices of the upper-face vertices R.
     """
     # Only the length of the displacement, not its direction: the upper face hardly follows from speech (blinks, brows),
     # so its liveliness can be asked for, but not its course.
@@ -117,17 +111,17 @@ def preconditioned_losses(
     """Squared errors of motion, velocity and acceleration in a motion space, and their weighted sum ``loss``.
 
     Squared and not Huber's, and without L_face: the mean of the motions that are possible is the minimum of the first
-    alone, and a sampler needs this mean. Huber's minimum lies nearer to the median, that of L_face at the liveliness of
+    alone, and a sampler needs this mean. Huber's minimum lies nearer to the median, L_face's at the liveliness of
     a whole motion, which a mean over many does not have.
 
     Args:
         prediction: predicted coordinates.
         truth: true coordinates.
         mask: valid frames.
-        importance: what a squared error of each coordinate counts in each clip.
+        importance: weights of squared errors, of each coordinate in each clip.
         weights: weight of ``reconstruction``, ``velocity`` and ``acceleration`` in the sum.
     """
-    # Differences over time are linear, so those of the error are the errors of velocity and acceleration.
+    # Differences over time are linear, so the error's differences are the errors of velocity and acceleration.
     gap, valid = prediction - truth, mask
     terms = {}
     for name in ("reconstruction", "velocity", "acceleration"):
@@ -138,28 +132,23 @@ def preconditioned_losses(
 
 
 def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str], temperature: float = 0.1) -> Scalar:
-    """Pulls styles of one identity together and those of different identities apart.
+    """Pulls styles of one identity together and styles of different identities apart.
 
     For every style, the mean negative log-probability of picking another one of the same identity among all others,
     with cosine similarities over the temperature as logits (supervised contrast, Khosla et al. 2020, eq. 2). Pulling
-    alone would be satisfied by one style for everybody. 0 if no identity has two styles, or there is one identity.
-
-    Args:
-        styles: style vectors.
-        identities: whose they are.
-        temperature: how sharp the choice is.
+    alone would be satisfied by one style for all. 0 if no identity has two styles, or there is one identity.
     """
-    same = torch.tensor([[one == other for other in identities] for one in identities], device=styles.device)
-    own = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
-    same &= ~own
+    same = torch.tensor([[first == second for second in identities] for first in identities], device=styles.device)
+    diagonal = torch.eye(len(identities), dtype=torch.bool, device=styles.device)
+    same &= ~diagonal
     directions = torch.nn.functional.normalize(styles.float(), dim=1)
     # A style is not compared with itself: its logit of −∞ takes it out of the softmax. The sum below leaves it out
     # by choice, since −∞ times a mask's 0 would be NaN.
-    logits = (directions @ directions.T / temperature).masked_fill(own, -torch.inf)
+    logits = (directions @ directions.T / temperature).masked_fill(diagonal, -torch.inf)
     chances = logits.log_softmax(1)
     counts = same.sum(1)
     # No identity has two styles, or all styles are of one identity: there is nothing to contrast.
-    if not counts.any() or bool(same.logical_or(own).all()):
+    if not counts.any() or bool(same.logical_or(diagonal).all()):
         return styles.new_zeros(())
     # Each style is an anchor that weighs the same however many others of its identity the batch has (L_out of the
     # paper); a sum over all pairs would let identities with many clips dominate.
@@ -168,11 +157,6 @@ def style_contrast(styles: Float[Tensor, "clips dim"], identities: Sequence[str]
 
 
 def style_identity_loss(logits: Float[Tensor, "clips identities"], identity: Int[Tensor, " clips"]) -> Scalar:
-    """Mean cross-entropy of telling whose a style is; clips of unseen speakers (−1) do not count.
-
-    Args:
-        logits: of a linear map of the style vectors.
-        identity: index of each clip's identity.
-    """
+    """Mean cross-entropy of a style's speaker; clips of unseen speakers (−1) do not count."""
     total = F.cross_entropy(logits.float(), identity, ignore_index=-1, reduction="sum")
     return total / (identity >= 0).sum().clamp_min(1)

@@ -38,13 +38,13 @@ def fused_losses(
     """The four losses of motion that is a linear map of features, and their weighted sum, in one pass.
 
     Equal to :func:`facediff.models.losses.training_losses` of the prediction ``features @ weight.T + bias`` and the
-    truth ``scale * truth``. Gradients are those of the sum alone, and are ready when it is.
+    truth ``scale * truth``. Gradients are the sum's alone, and are ready when it is.
 
     Under autocast to bfloat16 the prediction is made in full precision, since differences over time of half-precision
     motion are noise, and its gradient is back-propagated in bfloat16, as in any linear layer.
 
     Args:
-        features: what the map is applied to.
+        features: the map's input.
         weight: the map, all numbers of the first point, then of the second ….
         bias: its constant; None for none.
         truth: true motion.
@@ -117,7 +117,7 @@ class _FusedLosses(torch.autograd.Function):
         factor: Tensor,
         _: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        # The sum itself is nearly always what is back-propagated, with the factor 1. It is read on a processor only:
+        # Nearly always the sum itself is back-propagated, with the factor 1. It is read on a processor only:
         # on an accelerator that would wait for all work under way.
         if factor.device.type == "cpu" and factor.item() == 1:
             return *ctx.saved_tensors, None, None

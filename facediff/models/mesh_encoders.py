@@ -28,8 +28,8 @@ class MeshEncoder(nn.Module, ABC):
     """The vertices of each frame to one feature of ``dim`` channels; frames do not see one another.
 
     An encoder is made from sizes alone and given the mesh later, before its first use: weight averaging copies the
-    module before a corpus is known. What it keeps of the mesh are buffers whose shapes follow from the sizes; they are
-    in its state dict, next to the weights that were trained on them, so that a checkpoint does not depend on the
+    module before a corpus is known. Its tensors of the mesh are buffers with shapes that follow from the sizes; they
+    are in its state dict, next to the weights that were trained on them, so that a checkpoint does not depend on the
     version of the mesh simplifier.
     """
 
@@ -44,11 +44,7 @@ class MeshEncoder(nn.Module, ABC):
         return {}
 
     def attach(self, topology: Any) -> None:  # noqa: ANN401, B027 - an encoder that needs no mesh has nothing to do
-        """Take over what follows from the mesh.
-
-        Args:
-            topology: a :class:`facediff.mesh.hierarchy.MeshHierarchy` of :attr:`mesh_options`.
-        """
+        """Take over the mesh's tensors."""
 
     @abstractmethod
     def forward(self, motion: Motion) -> Frames:
@@ -60,14 +56,6 @@ class MeshEncoderFactory(Protocol):
 
     def __call__(self, *, dim: int, n_vertices: int, dims: int) -> MeshEncoder:
         """Make one for features of ``dim`` channels and motion of ``n_vertices`` points of ``dims`` numbers."""
-
-
-def check_points(motion: Tensor, n_vertices: int, dims: int) -> None:
-    """Refuse motion (batch, frames, points, dims) on another mesh, or of another space."""
-    if motion.shape[2:] != (n_vertices, dims):
-        raise ValueError(
-            f"motion has {tuple(motion.shape[2:])} points, but the mesh encoder was made for {n_vertices, dims}"
-        )
 
 
 @mesh_encoder.register("linear")
@@ -87,7 +75,6 @@ class LinearMeshEncoder(MeshEncoder):
 
     def forward(self, motion: Motion) -> Frames:
         """The feature of each frame."""
-        check_points(motion, self.n_vertices, self.dims)
         return self.map(motion.flatten(2))
 
 
@@ -95,7 +82,7 @@ class LinearMeshEncoder(MeshEncoder):
 class ComponentMeshEncoder(MeshEncoder):
     """One linear map of a frame's principal components, each of unit variance.
 
-    In X = Linear(M_ref) on vertices, what the map learns of a movement grows with the movement's size: it sees the jaw
+    In X = Linear(M_ref) on vertices, the map's gradient for a movement grows with the movement's size: it sees the jaw
     and hardly the lids and brows, by which people differ as well. Here all movements come alike.
 
     Args:
@@ -115,8 +102,6 @@ class ComponentMeshEncoder(MeshEncoder):
 
     def forward(self, motion: Motion | Float[Tensor, "batch frames all_components"]) -> Frames:
         """The feature of each frame, of offsets or of their components."""
-        if motion.dim() == 4:
-            check_points(motion, self.n_vertices, self.dims)
         return self.map(self.components.project(motion))
 
 
@@ -141,15 +126,15 @@ class SpiralDown(nn.Module):
     map: nn.Linear
 
     def __init__(
-        self, fine: int, coarse: int, length: int, in_channels: int, out_channels: int, *, mean: bool = False
+        self, n_fine: int, n_coarse: int, length: int, in_channels: int, out_channels: int, *, mean: bool = False
     ) -> None:
         super().__init__()
-        self.sizes = fine, coarse
-        taken = fine if mean else coarse
-        self.register_buffer("table", torch.zeros(taken, length, dtype=torch.int64))
-        self.register_buffer("rows", torch.zeros(taken, dtype=torch.int64) if mean else None)
-        self.register_buffer("weights", torch.zeros(taken) if mean else None)
-        # A linear map of the concatenated spiral is a convolution whose filter depends on the position along the
+        self.sizes = n_fine, n_coarse
+        n_points = n_fine if mean else n_coarse
+        self.register_buffer("table", torch.zeros(n_points, length, dtype=torch.int64))
+        self.register_buffer("rows", torch.zeros(n_points, dtype=torch.int64) if mean else None)
+        self.register_buffer("weights", torch.zeros(n_points) if mean else None)
+        # A linear map of the concatenated spiral is a convolution with a filter that depends on the position along the
         # spiral: the fixed order of neighbours stands in for the grid of pixels.
         self.map = nn.Linear(length * in_channels, out_channels)
         nn.init.xavier_uniform_(self.map.weight)
@@ -244,29 +229,10 @@ class SpiralMeshEncoder(MeshEncoder):
         }
 
     def attach(self, topology: Any) -> None:  # noqa: ANN401 - a component does not import the topology's types
-        """Take over the down-samplings, and the spirals of the vertices that each of them takes.
-
-        Args:
-            topology: a mesh hierarchy of :attr:`mesh_options`.
-        """
-        sizes = [level.n_vertices for level in topology.levels]
-        expected = [self.n_vertices, *(step.sizes[1] for step in self.steps)]
-        if sizes != expected:
-            raise FaceDiffError(
-                f"mesh encoder: the mesh has {sizes} vertices at its levels; expected {expected}: make the hierarchy "
-                f"with the encoder's mesh_options"
-            )
-        tables = []
+        """Take over the down-samplings, and the spirals of the vertices that each of them takes."""
         for step, level in zip(self.steps, topology.levels, strict=False):
-            tables.append(torch.as_tensor(level.spirals, dtype=torch.int64)[torch.as_tensor(level.down.columns)])
-            if tables[-1].shape != step.table.shape:
-                raise FaceDiffError(
-                    f"mesh encoder: the mesh has spirals of the shape {tuple(tables[-1].shape)}; expected "
-                    f"{tuple(step.table.shape)}: make the hierarchy with the encoder's mesh_options"
-                )
-        # Only now, when all shapes have been checked: an encoder is attached completely or not at all.
-        for step, level, table in zip(self.steps, topology.levels, tables, strict=False):
-            step.table.copy_(table)
+            spirals = torch.as_tensor(level.spirals, dtype=torch.int64)
+            step.table.copy_(spirals[torch.as_tensor(level.down.columns)])
             if step.rows is not None and step.weights is not None:
                 step.rows.copy_(torch.as_tensor(level.down.rows))
                 step.weights.copy_(torch.as_tensor(level.down.weights))
@@ -275,7 +241,6 @@ class SpiralMeshEncoder(MeshEncoder):
 
     def forward(self, motion: Motion) -> Frames:
         """The feature of each frame."""
-        check_points(motion, self.n_vertices, 3)
         if not self.attached:
             raise FaceDiffError("mesh encoder: the mesh is not known yet; attach a hierarchy, or load trained weights")
         x = motion.flatten(0, 1).permute(1, 2, 0).contiguous()

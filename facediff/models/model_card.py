@@ -1,6 +1,6 @@
 """Model cards: the ``README.md`` of a model folder, with the metadata that the Hugging Face hub reads.
 
-A card states what is known of a model and says so where something is not. Scores come with their protocol, the hashes
+A card states the known facts of a model and says where one is unknown. Scores come with their protocol, the hashes
 of the regions that they were taken over, and the frames and sequences that went into them, as the test wrote them.
 """
 
@@ -34,19 +34,19 @@ ABOUT = {
     *("split", "method", "unseen_identity", "protocol", "frames", "sequences", "cut_prediction", "cut_truth"),
     *("seed", "checkpoint", "components"),
 }
-"""Columns of a table of scores that are no scores; those of regions end in ``_vertices`` and ``_hash``."""
+"""Columns of a table of scores that are no scores; columns of regions end in ``_vertices`` and ``_hash``."""
 
 LONGEST_NAME = 96
 
 
 @dataclass(frozen=True)
 class CardFacts:
-    """What a card says in addition to what the model knows.
+    """Contents of a card that the model does not hold.
 
     Attributes:
         name: the model's name.
         scores: rows of a table that ``facediff test`` wrote for this very model; none if it was not tested.
-        languages: codes of the languages that it was trained on, such as ``en``; those of the corpus if None.
+        languages: codes of the languages that it was trained on, such as ``en``; the corpus's if None.
         half: whether its parameters are stored in 16 bits.
         sizes: bytes of the folder's files by name.
     """
@@ -85,7 +85,7 @@ def is_score(column: str) -> bool:
 
 
 def check_languages(languages: Iterable[str]) -> None:
-    """Refuse what is no code of a language."""
+    """Refuse a text that is no code of a language."""
     for code in languages:
         if not re.fullmatch(r"[a-z]{2,3}(-[A-Za-z0-9]{2,8})*", code):
             raise FaceDiffError(f"--languages {quoted(code)}: expected codes such as en or zh-CN, separated by commas")
@@ -316,14 +316,14 @@ def score_section(model: CheckpointContent, facts: CardFacts) -> str:
         for row in facts.scores
     ]
     regions = [column.removesuffix("_hash") for column in first if column.endswith("_hash")]
-    taken = [
+    score_rows = [
         f"{text(region)}: {text(first.get(f'{region}_vertices', ''))} vertices, hash `{text(first[f'{region}_hash'])}`"
         for region in regions
     ]
     policy = text(first.get("unseen_identity", ""))
     notes = [
         f"Protocol `{text(first['protocol'])}`; lower is better; unit of length {text(model.assets.unit)}.",
-        f"Regions: {'; '.join(taken)}." if taken else "",
+        f"Regions: {'; '.join(score_rows)}." if score_rows else "",
         f"Unseen speakers were tested with the identity policy `{policy}`." if policy else "",
         "The other rows are baselines: a face that never moves, the speaker's mean face, and this model with the "
         "speech of another clip. docs/metrics.md of facediff defines every score.",
@@ -335,7 +335,7 @@ def score_section(model: CheckpointContent, facts: CardFacts) -> str:
 
 
 def languages_of(model: CheckpointContent, facts: CardFacts) -> Sequence[str]:
-    """The languages that were stated, else those of the corpus."""
+    """The languages that were stated, else the corpus's."""
     if facts.languages is not None:
         return facts.languages
     corpora: list[type[Any]] = [entry.implementation for entry in corpus]

@@ -3,11 +3,11 @@
 From top to bottom: principal components of the training motion, the two spaces, and the preconditioning that a space
 with known variances makes possible. Choosing ``components`` changes three things:
 
-- A frame is a few dozen numbers, whatever the mesh.
+- A frame is a few dozen numbers for any mesh.
 - The noise hides the motion: vertices move together, so independent noise on thousands of them averages out, and a
   model reads half of the motion off its noisy input at almost every step without listening to the speech.
-- The network predicts what the noisy motion leaves open, and no longer the whole motion: a network of limited width
-  cannot copy what it is shown, and ancestral sampling repeats that error a thousand times.
+- The network predicts the part that the noisy motion leaves open, and no longer the whole motion: a network of
+  limited width cannot copy its input, and ancestral sampling repeats that error a thousand times.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Projection:
 
     Attributes:
         into: the linear map, (dims · V, K).
-        offset: what is subtracted, (K,).
+        offset: subtracted first, (K,).
     """
 
     into: Float[Tensor, "all components"]
@@ -148,8 +148,8 @@ class PrincipalComponents(nn.Module):
 
     def projection(self, scale: float) -> Projection:
         """The same for unscaled offsets, by itself, on the processor and in float32 as clips are read."""
-        own = self._projection()
-        return Projection((own.into * scale).float().cpu(), own.offset.float().cpu())
+        projection = self._projection()
+        return Projection((projection.into * scale).float().cpu(), projection.offset.float().cpu())
 
     def _projection(self) -> Projection:
         weighted = self.basis * self.weights if self.unweighted is None else self.basis @ self.weights
@@ -157,7 +157,7 @@ class PrincipalComponents(nn.Module):
         return Projection(into, self.mean @ into)
 
     def expand(self, components: Float[Tensor, "batch frames components"]) -> Float[Tensor, "batch frames points dims"]:
-        """The scaled offsets with these components; all other components are those of the mean."""
+        """The scaled offsets with these components; all other components are the mean's."""
         with torch.autocast(components.device.type, enabled=False):
             back = components.to(self.basis.dtype) * self.deviations
             # The basis is orthonormal in weighted coordinates, so its transpose is its inverse there; then the weights
@@ -174,7 +174,7 @@ class MotionSpace(nn.Module, ABC):
     Attributes:
         coordinates: numbers in a frame.
         preconditioning: the scales around the network; None if it predicts clean motion itself.
-        prior_frames: length of the windows whose covariance over time :meth:`fit` wants; 1 for none.
+        prior_frames: length of the windows of which :meth:`fit` takes the covariance over time; 1 for none.
     """
 
     coordinates: int
@@ -192,22 +192,17 @@ class MotionSpace(nn.Module, ABC):
         return {}
 
     def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
-        """Variances of principal components as the noise sees them, from those of the motion."""
+        """Variances of principal components as the noise sees them, from the motion's variances."""
         return variances
 
     def fit(  # noqa: B027
         self, signal: Float[Tensor, " steps"], covariance: Float[Tensor, "components window window"] | None = None
     ) -> None:
-        """Take over the noise process, once the principal components are known.
-
-        Args:
-            signal: ᾱ of every step.
-            covariance: of the components over the frames of a window, where the space asks for it.
-        """
+        """Take over the noise process, once the principal components are known."""
 
     @abstractmethod
     def encode(self, motion: Offsets) -> Coordinates:
-        """From scaled offsets to what is noised."""
+        """From scaled offsets to the coordinates that are noised."""
 
     @abstractmethod
     def decode(self, coordinates: Coordinates) -> Offsets:
@@ -248,10 +243,10 @@ class VertexMotion(MotionSpace):
 
 @motion_space.register("components")
 class ComponentMotion(MotionSpace):
-    """Principal components of the training motion; the network predicts what the noisy motion leaves open.
+    """Principal components of the training motion; the network predicts the part that noise leaves open.
 
     A component of standard deviation d is noised at the size d₁ · (d / d₁)^(1 − whitening), with the largest deviation
-    d₁. Losses weigh each component as its vertices do, whatever its size in the noise.
+    d₁. Losses weigh each component as its vertices do, at any size in the noise.
 
     Args:
         n_vertices: points; given by the model.
@@ -267,8 +262,8 @@ class ComponentMotion(MotionSpace):
             upper face. Lids are few vertices: so counted, a short training leaves them to the Gaussian prior, and they
             wander instead of resting and blinking.
         prior_frames: length W of the windows, in frames, in which the preconditioning knows how each component moves
-            over time, measured on the training split; odd. 1 takes every frame by itself, so that what a network leaves
-            of the noise is jitter.
+            over time, measured on the training split; odd. 1 takes every frame by itself, so that the noise which a
+            network leaves is jitter.
     """
 
     sizes: Tensor
@@ -305,7 +300,7 @@ class ComponentMotion(MotionSpace):
 
     @property
     def region_weights(self) -> Mapping[str, float]:
-        """Those of upper face, lips and eyelids."""
+        """Factors of upper face, lips and eyelids."""
         return self._region_weights
 
     def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
@@ -315,18 +310,14 @@ class ComponentMotion(MotionSpace):
     def modes(
         self, covariance: Float[Tensor, "components window window"]
     ) -> tuple[Float[Tensor, " modes"], Float[Tensor, " modes"]]:
-        """Variances of the movements over a window, as the noise sees them, and their shares of the middle frame's.
-
-        Args:
-            covariance: of the components, each of unit variance, over the frames of a window.
-        """
+        """Variances of the movements over a window, as the noise sees them, and their shares of the middle frame's."""
         deviations = self.components.deviations.cpu().double()
         variances, vectors = torch.linalg.eigh(covariance.double())
         variances = variances.clamp_min(0)
-        # The middle frame has the whole window around it; what a movement does there stands for what is seen of it.
-        shown = vectors[:, self.prior_frames // 2].square() * variances
+        # The middle frame has the whole window around it; a movement there stands for the visible part.
+        mode_variances = vectors[:, self.prior_frames // 2].square() * variances
         noised = variances * self._sizes(deviations).square()[:, None]
-        return noised.flatten(), (shown * deviations.square()[:, None]).flatten()
+        return noised.flatten(), (mode_variances * deviations.square()[:, None]).flatten()
 
     def _sizes(self, deviations: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
         # In proportion to the largest, so that the unit of the corpus drops out; floored, since a corpus with fewer
@@ -363,7 +354,8 @@ class Preconditioning(nn.Module):
 
     For motion x of known variance λ, noised to y = √ᾱ x + √(1 − ᾱ) ε, the prediction of clean motion is
     skip · y + out · F(into · y). Without any network, F = 0, it is the posterior mean of Gaussian motion; F has to say
-    what speech and style tell beyond that, in units of what is left open. All four tables are (steps, coordinates).
+    what speech and style tell beyond that, in units of the deviation left open. All four tables are (steps,
+    coordinates).
 
     Args:
         steps: of the noise process.
@@ -373,7 +365,7 @@ class Preconditioning(nn.Module):
         into: 1 / √(ᾱλ + 1 − ᾱ), which gives the network's input unit variance.
         skip: √ᾱ λ / (ᾱλ + 1 − ᾱ), the Wiener filter.
         out: √(λ(1 − ᾱ) / (ᾱλ + 1 − ᾱ)), the deviation that the filter leaves open.
-        loss: weights of squared errors: those of the vertices, divided by what the filter leaves open in a step, so
+        loss: weights of squared errors: the vertices' weights over the variance that the filter leaves in a step, so
             that every step counts alike.
     """
 
@@ -398,24 +390,24 @@ class Preconditioning(nn.Module):
         Args:
             signal: ᾱ of every step.
             variances: λ of every coordinate.
-            importance: what a squared error of each coordinate counts.
+            importance: weights of squared errors of each coordinate.
         """
         # In float64: 1 − ᾱ loses all digits at the clean end.
-        kept, own, counted = signal.cpu().double()[:, None], variances.cpu().double(), importance.cpu().double()
+        alpha, variance, weights = signal.cpu().double()[:, None], variances.cpu().double(), importance.cpu().double()
         # Gaussian motion y = √ᾱ x + √(1 − ᾱ) ε has the variance ᾱλ + 1 − ᾱ; given y, x has the mean √ᾱ λ y / total and
         # the variance λ (1 − ᾱ) / total. These are the tables.
-        total = kept * own + 1 - kept
-        left = own * (1 - kept) / total
+        total = alpha * variance + 1 - alpha
+        left = variance * (1 - alpha) / total
         self.into.copy_(total.rsqrt())
-        self.skip.copy_(kept.sqrt() * own / total)
+        self.skip.copy_(alpha.sqrt() * variance / total)
         self.out.copy_(left.sqrt())
         # Normalised over the coordinates of a step: near the clean end the filter leaves hardly any error open, and
         # such steps would otherwise not be trained.
-        self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
+        self.loss.copy_(weights / (weights * left).sum(1, keepdim=True))
 
     def hidden(self) -> Float[Tensor, " steps"]:
         """The share of the motion that noise leaves open in each step, counted as the losses count."""
-        # The weights of a step are those of the last one, over what is left open relative to it.
+        # The weights of a step are the last one's, over the variance left open relative to it.
         return self.loss[-1, 0] / self.loss[:, 0]
 
     def posterior_mean(
@@ -434,7 +426,7 @@ class Preconditioning(nn.Module):
         step: Int[Tensor, " batch"],
         mask: Bool[Tensor, "batch frames"],  # noqa: ARG002
     ) -> Float[Tensor, "batch frames inputs"]:
-        """What the network sees, given the noisy motion and its posterior mean; of unit variance."""
+        """The network's input, given the noisy motion and its posterior mean; of unit variance."""
         return self.into[step][:, None] * noisy
 
     def clean(
@@ -451,16 +443,16 @@ class Preconditioning(nn.Module):
 
 
 class TemporalPreconditioning(Preconditioning):
-    """The same for motion whose covariance over time is known: the skip is a smoother, and so is the output's scale.
+    """The same for motion with a known covariance over time: the skip is a smoother, and so is the output's scale.
 
     With the covariance C = V Λ Vᵀ of a coordinate in a window of W frames, noised window y, the posterior mean is
     V [√ᾱ Λ / (ᾱΛ + 1 − ᾱ)] Vᵀ y, and the posterior covariance V [Λ (1 − ᾱ) / (ᾱΛ + 1 − ᾱ)] Vᵀ. The prediction is the
-    mean plus the symmetric root of the covariance times the network's output: what the network errs from frame to
-    frame comes out as small as motion is at that frequency. Without any network it is the posterior mean of Gaussian
+    mean plus the symmetric root of the covariance times the network's output: the network's errors from frame to
+    frame come out as small as motion is at that frequency. Without any network it is the posterior mean of Gaussian
     motion with this covariance, and so the exact sampler of it.
 
     A frame lies in the middle of its window, and nearer to an end only where the clip or the window of a stream ends.
-    What is shorter than W is taken as if it went on at the mean: without any network, its last frames vary by a quarter
+    Shorter motion is taken as if it went on at the mean: without any network, its last frames vary by a quarter
     to a half too little.
 
     Args:
@@ -494,13 +486,7 @@ class TemporalPreconditioning(Preconditioning):
         covariance: Float[Tensor, "coordinates window window"],
         importance: Float[Tensor, " coordinates"],
     ) -> None:
-        """Fill the tables for motion of given covariances over time.
-
-        Args:
-            signal: as :meth:`fit` takes it.
-            covariance: C of every coordinate.
-            importance: as :meth:`fit` takes it.
-        """
+        """Fill the tables for motion of given covariances over time."""
         wide = covariance.cpu().double()
         variances, vectors = torch.linalg.eigh((wide + wide.flip(1, 2)) / 2)  # motion runs both ways alike
         middle = self.frames // 2
@@ -509,18 +495,18 @@ class TemporalPreconditioning(Preconditioning):
         self.vectors.copy_(vectors)
         self.variances.copy_(variances)
         self.signal.copy_(signal)
-        kept, counted = signal.cpu().double()[:, None, None], importance.cpu().double()
-        total, shares = kept * variances + 1 - kept, vectors[:, middle].square()
-        left = (shares * variances * (1 - kept) / total).sum(2)
-        self.into_mean.copy_((shares * kept * variances.square() / total).sum(2).clamp_min(1e-30).rsqrt())
-        self.loss.copy_(counted / (counted * left).sum(1, keepdim=True))
+        alpha, weights = signal.cpu().double()[:, None, None], importance.cpu().double()
+        total, shares = alpha * variances + 1 - alpha, vectors[:, middle].square()
+        left = (shares * variances * (1 - alpha) / total).sum(2)
+        self.into_mean.copy_((shares * alpha * variances.square() / total).sum(2).clamp_min(1e-30).rsqrt())
+        self.loss.copy_(weights / (weights * left).sum(1, keepdim=True))
 
     def posterior_mean(
         self, noisy: Coordinates, step: Int[Tensor, " batch"], mask: Bool[Tensor, "batch frames"]
     ) -> Coordinates:
         """The smoothed motion; ``mask`` is True on valid frames."""
-        kept = self.signal[step][:, None, None]
-        return self._filtered(noisy, kept.sqrt() * self.variances / (kept * self.variances + 1 - kept), mask)
+        alpha = self.signal[step][:, None, None]
+        return self._filtered(noisy, alpha.sqrt() * self.variances / (alpha * self.variances + 1 - alpha), mask)
 
     def inputs(
         self,
@@ -532,10 +518,10 @@ class TemporalPreconditioning(Preconditioning):
         """The noisy motion, and the smoothed one of the frame and of some around it, of unit variance."""
         # A Gaussian prior takes blinks for drift: the smoothed motion is to be made sharp where it has the course of a
         # blink, and smaller everywhere else. A short training does not find that course in the noise of many frames.
-        count, most = noisy.shape[1], max(SEEN_AROUND)
-        around = nn.functional.pad(self.into_mean[step][:, None] * mean * mask[..., None], (0, 0, most, most))
-        seen = [around[:, most + offset : most + offset + count] for offset in SEEN_AROUND]
-        return torch.cat([super().inputs(noisy, mean, step, mask), *seen], -1)
+        count, reach = noisy.shape[1], max(SEEN_AROUND)
+        around = nn.functional.pad(self.into_mean[step][:, None] * mean * mask[..., None], (0, 0, reach, reach))
+        neighbours = [around[:, reach + offset : reach + offset + count] for offset in SEEN_AROUND]
+        return torch.cat([super().inputs(noisy, mean, step, mask), *neighbours], -1)
 
     def clean(
         self,
@@ -545,8 +531,8 @@ class TemporalPreconditioning(Preconditioning):
         mask: Bool[Tensor, "batch frames"],
     ) -> Coordinates:
         """The prediction of clean motion from the posterior mean and the network's output."""
-        kept = self.signal[step][:, None, None]
-        left = self.variances * (1 - kept) / (kept * self.variances + 1 - kept)
+        alpha = self.signal[step][:, None, None]
+        left = self.variances * (1 - alpha) / (alpha * self.variances + 1 - alpha)
         return mean + self._filtered(features, left.sqrt(), mask)
 
     def _filtered(
@@ -566,7 +552,7 @@ class TemporalPreconditioning(Preconditioning):
         values = nn.functional.pad(values * mask[..., None], (0, 0, half, width)).transpose(1, 2)
         inner = torch.einsum("bctw,bcw->btc", values.unfold(2, width, 1)[:, :, :count], rows[:, :, half])
         # The first and the last frames are in the middle of no window: they take other rows of the outermost ones.
-        place, length = torch.arange(count, device=mask.device), mask.sum(1)[:, None]
+        frame, length = torch.arange(count, device=mask.device), mask.sum(1)[:, None]
         start = (length - width).clamp_min(0)
         index = (start + half + torch.arange(width, device=mask.device))[:, None].expand(-1, values.shape[1], -1)
         outermost = [
@@ -574,9 +560,9 @@ class TemporalPreconditioning(Preconditioning):
                 1, row[..., None].expand(*values.shape[:1], -1, values.shape[1])
             )
             for window, row in (
-                (values[..., half : half + width], place.clamp_max(width - 1)[None]),
-                (values.gather(2, index), (place - start).clamp(0, width - 1)),
+                (values[..., half : half + width], frame.clamp_max(width - 1)[None]),
+                (values.gather(2, index), (frame - start).clamp(0, width - 1)),
             )
         ]
-        filtered = torch.where((place < half)[:, None], outermost[0], inner)
-        return torch.where((place >= length - half)[..., None], outermost[1], filtered)
+        filtered = torch.where((frame < half)[:, None], outermost[0], inner)
+        return torch.where((frame >= length - half)[..., None], outermost[1], filtered)

@@ -1,4 +1,4 @@
-"""Optimisers and learning-rate schedules: a model's default ones, those of ``--optimizer``, and what a resume keeps."""
+"""Optimisers and learning-rate schedules: a model's defaults, ``--optimizer``, and their state at a resume."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def lr_factor(
     decay: float = 0.9,
     decay_epoch: int = 30,
 ) -> float:
-    """What the learning rate is multiplied by at an optimiser step.
+    """Factor of the learning rate at an optimiser step.
 
     Args:
         step: the step, counted from 0.
@@ -76,22 +76,22 @@ class FactorSchedule(LRScheduler):
 
     def get_lr(self) -> list[float | torch.Tensor]:
         """The learning rate of every group at this step."""
-        before, now = self.factor(max(0, self.last_epoch - 1)), self.factor(self.last_epoch)
+        previous, factor = self.factor(max(0, self.last_epoch - 1)), self.factor(self.last_epoch)
         for group in self.optimizer.param_groups:
-            group.setdefault("initial_lr", group["lr"] / before if before else group["lr"])
-        return [group["initial_lr"] * now for group in self.optimizer.param_groups]
+            group.setdefault("initial_lr", group["lr"] / previous if previous else group["lr"])
+        return [group["initial_lr"] * factor for group in self.optimizer.param_groups]
 
     def state_dict(self) -> dict[str, Any]:
         """The position, as plain data."""
         return {name: value for name, value in super().state_dict().items() if name != "factor"}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue from a position, also of 1.x, whose schedules were ``LambdaLR``."""
+        """Continue from a position, also of 1.x, with its ``LambdaLR``."""
         super().load_state_dict({k: v for k, v in state_dict.items() if k not in ("base_lrs", "lr_lambdas")})
 
 
 def parameter_groups(model: LightningModule, options: Mapping[str, Mapping[str, Any]] | None) -> list[dict[str, Any]]:
-    """The trainable parameters in groups: those of some parts with options of their own, all others first.
+    """The trainable parameters in groups: parts with options of their own, all others first.
 
     Args:
         model: the model.
@@ -109,32 +109,26 @@ def parameter_groups(model: LightningModule, options: Mapping[str, Mapping[str, 
             groups[owner]["params"].append(parameter)
     for name, group in groups.items():
         if name and not group["params"]:
-            named = {f"model.parameter_groups.{name}": ""}
-            raise ArgumentError(named, f"nothing to train there: {choices(name, parts)}", located=True)
+            messages = {f"model.parameter_groups.{name}": ""}
+            raise ArgumentError(messages, f"nothing to train there: {choices(name, parts)}", located=True)
     return [group for group in groups.values() if group["params"]]
 
 
 def configure(
     model: LightningModule, optimizer: Description | None, lr_scheduler: Description | None
 ) -> OptimizerLRScheduler:
-    """The optimiser and the schedule of ``--optimizer`` and ``--lr_scheduler``, each as a model has it where not given.
-
-    Args:
-        model: of facediff; its ``parameter_groups`` hold for every optimiser.
-        optimizer: class and options; the model's AdamW if None.
-        lr_scheduler: class and options; the model's ``lr_schedule`` with its warm-up if None.
-    """
+    """The optimiser and the schedule of ``--optimizer`` and ``--lr_scheduler``, or the model's own."""
     model_: Any = model
     if optimizer is None:
-        made = model_.default_optimizer()
+        result = model_.default_optimizer()
     else:
-        made = instantiate_class(parameter_groups(model, model_.parameter_groups), dict(optimizer))
+        result = instantiate_class(parameter_groups(model, model_.parameter_groups), dict(optimizer))
     if lr_scheduler is None:
-        return model_.scheduled(made)
-    schedule: Any = instantiate_class(made, dict(lr_scheduler))
+        return model_.scheduled(result)
+    schedule: Any = instantiate_class(result, dict(lr_scheduler))
     schedule.description = dict(lr_scheduler)  # a part of its state in checkpoints, see schedule_changed
-    apply_at_resume(made)
-    return LightningCLI.configure_optimizers(model, made, schedule)
+    apply_at_resume(result)
+    return LightningCLI.configure_optimizers(model, result, schedule)
 
 
 def schedule_changed(checkpoint: Mapping[str, Any], lr_scheduler: Description | None) -> bool:
@@ -161,11 +155,11 @@ def apply_at_resume(optimizer: Optimizer) -> Optimizer:
 
 def _with_options(stated: list[dict[str, Any]], optimizer: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
     groups = [dict(group) for group in state["param_groups"]]
-    missing = [name for name in optimizer.defaults if any(name not in group for group in groups)]
-    if missing:
+    absent_options = [name for name in optimizer.defaults if any(name not in group for group in groups)]
+    if absent_options:
         raise FaceDiffError(
-            f"--optimizer: the checkpoint's training had another optimiser, without {', '.join(missing)}; resume with "
-            f"the same one, or start a new training"
+            f"--optimizer: the checkpoint's training had another optimiser, without {', '.join(absent_options)}; "
+            f"resume with the same one, or start a new training"
         )
     for new, group in zip(stated, groups, strict=False):  # BaseFinetuning adds further ones
         before = group.get("initial_lr", group["lr"])

@@ -40,7 +40,7 @@ from facediff.utils.torch_files import read_safetensors, write_safetensors
 from facediff.version import __version__
 
 FORMAT = "facediff model 1"
-"""Mark of the format of model folders; those of another mark are refused."""
+"""Mark of the format of model folders; folders of another mark are refused."""
 
 DATA_OPTIONS_KEY = "datamodule_hyper_parameters"
 """Where a checkpoint keeps the options of the data module."""
@@ -97,17 +97,17 @@ def publish(
 
 
 def published_licences(inherited: Iterable[Licence], name: str | None) -> tuple[Licence, ...]:
-    """A model's labels once it is published: that of its weights, and those that it inherits.
+    """A published model's labels: its weights' own, and all that it inherits.
 
     Args:
         inherited: the model's labels.
-        name: the licence that its author chose for the weights; that of the data if None.
+        name: the licence that its author chose for the weights; the data's if None.
     """
     labels = list(inherited)
-    others = [label for label in labels if label.of != "weights"]
-    # Weights that derive from published weights inherit their terms, as those of the parent.
+    data_labels = [label for label in labels if label.of != "weights"]
+    # Weights that derive from published weights inherit their terms, as the parent's do.
     parents = [replace(label, of="parent's weights") for label in labels if label.of == "weights"] if name else []
-    return merged([weights_licence(labels, name)], parents, others)
+    return merged([weights_licence(labels, name)], parents, data_labels)
 
 
 def weights_licence(inherited: Iterable[Licence], name: str | None) -> Licence:
@@ -157,14 +157,14 @@ def write_model(model: CheckpointContent, folder: Path, *, half: bool = False) -
 
 
 def content_of(model: CheckpointContent) -> dict[str, Any]:
-    """What a checkpoint of the model holds for inference; no folder of this machine is named in it."""
+    """The content of the model's checkpoint for inference; no folder of this machine is named in it."""
     content: dict[str, Any] = {"hyper_parameters": dict(model.hparams), "state_dict": model.state_dict()}
     model.on_save_checkpoint(content)
     return without_folders({**content, DATA_OPTIONS_KEY: model.data_options})
 
 
 def without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of a checkpoint without its corpus's folders and any absolute path; so that of its further faces."""
+    """The content of a checkpoint without its corpus's folders and any absolute path; its further faces too."""
     source, options = content.get(DATA_SOURCE_KEY) or {}, content.get(DATA_OPTIONS_KEY) or {}
     cleaned = {
         **content,
@@ -190,18 +190,21 @@ def without_paths(value: Any) -> Any:  # noqa: ANN401 - plain data
 
 def stored_once(weights: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The weights without those that equal an earlier one, and for each of these the earlier one's name."""
-    kept: dict[str, Tensor] = {}
+    unique: dict[str, Tensor] = {}
     shared: dict[str, str] = {}
-    seen: dict[tuple[Any, ...], list[str]] = {}
+    by_content: dict[tuple[Any, ...], list[str]] = {}
     for name, value in weights.items():
-        alike = seen.setdefault((value.dtype, tuple(value.shape)), [])
-        twin = next((other for other in alike if value.numel() > 1 and torch.equal(kept[other], value)), None)
+        alike = by_content.setdefault((value.dtype, tuple(value.shape)), [])
+        twin = next(
+            (name_of_twin for name_of_twin in alike if value.numel() > 1 and torch.equal(unique[name_of_twin], value)),
+            None,
+        )
         if twin is None:
-            kept[name] = value
+            unique[name] = value
             alike.append(name)
         else:
             shared[name] = twin
-    return kept, shared
+    return unique, shared
 
 
 def halved(value: Tensor) -> Tensor:
@@ -211,12 +214,7 @@ def halved(value: Tensor) -> Tensor:
 
 
 def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
-    """A model folder as the content of a checkpoint; only its form is checked.
-
-    Args:
-        folder: the folder.
-        weights: whether the weights are read too.
-    """
+    """A model folder as the content of a checkpoint; only its form is checked."""
     path = folder / CONFIG
     config = load_json(path, remedy=REMEDY)
     if not isinstance(config, dict) or config.keys() != PARTS:
@@ -251,12 +249,12 @@ def as_plain(value: Any, tensors: dict[str, Tensor], name: str) -> Any:  # noqa:
             raise FaceDiffError(f"the model keeps {quoted(value)} in {name}; expected values by name")
         return {key: as_plain(part, tensors, f"{name}.{key}".lstrip(".")) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [as_plain(part, tensors, f"{name}.{place}") for place, part in enumerate(value)]
+        return [as_plain(part, tensors, f"{name}.{index}") for index, part in enumerate(value)]
     return value
 
 
 def with_tensors(value: Any, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Any:  # noqa: ANN401
-    """Undo :func:`as_plain`; whoever reads a file names it in what a tensor of another size or type raises."""
+    """Undo :func:`as_plain`; the caller names the file in errors of a tensor's size or type."""
     if isinstance(value, list):
         return [with_tensors(part, arrays) for part in value]
     if not isinstance(value, dict):

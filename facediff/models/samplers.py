@@ -65,7 +65,7 @@ class NoiseProcess:
         scale: what motion is multiplied by before it is noised (Chen 2023, arXiv 2301.10972): below 1, noise hides more
             of it at every step. The noisy motion is divided by its new size, so that this is another schedule for the
             same motion: ᾱ becomes b²ᾱ / (b²ᾱ + 1 − ᾱ).
-        variances: those of another schedule, in the precision in which all is computed; instead of steps and schedule.
+        variances: of another schedule, in the precision in which all is computed; instead of steps and schedule.
 
     Attributes:
         variances: the noise variance α_n of each step, float32.
@@ -94,8 +94,8 @@ class NoiseProcess:
         if scale != 1:
             # In float64, so that 1 − ᾱ keeps its digits at the clean end. The variances follow from the new ᾱ as α_n =
             # 1 − ᾱ_n / ᾱ_{n−1}, so that eq. 1 and its closed form still agree.
-            shown = scale**2 * self.signal.double()
-            signal = shown / (shown + 1 - self.signal.double())
+            scaled = scale**2 * self.signal.double()
+            signal = scaled / (scaled + 1 - self.signal.double())
             before = torch.cat([signal.new_ones(1), signal[:-1]])
             # At most the largest number below 1: samplers and losses divide by the noise, which is never none.
             self.signal, self.variances = signal.float().clamp_max(1 - 2**-24), (1 - signal / before).float()
@@ -124,14 +124,7 @@ class NoiseProcess:
         generator: torch.Generator | None = None,
         weights: Float[Tensor, " steps"] | None = None,
     ) -> Int[Tensor, " batch"]:
-        """Random step numbers (algorithm 1, line 3).
-
-        Args:
-            batch: how many.
-            device: where they are drawn.
-            generator: random numbers.
-            weights: probabilities of the steps, such as those of the dual path's recipe; all alike if None.
-        """
+        """Random step numbers (algorithm 1, line 3)."""
         if weights is not None:
             return torch.multinomial(weights.to(device), batch, replacement=True, generator=generator)
         return torch.randint(0, self.steps, (batch,), device=device, generator=generator)
@@ -164,8 +157,8 @@ def visited(
     if spacing == "steps" and last_noise is None and first_noise is None:
         # From the end of the process, since sampling starts from pure noise; the clean end itself is no step.
         return [round(process.steps * (steps - i) / steps) - 1 for i in range(steps)]
-    kept = process.signal.double()
-    snr = torch.log(kept / (1 - kept)) / 2  # falls from step to step
+    signal = process.signal.double()
+    snr = torch.log(signal / (1 - signal)) / 2  # falls from step to step
     cleanest = 0 if last_noise is None else int((snr + math.log(last_noise)).abs().argmin())
     start = snr[-1] if first_noise is None else snr[-1].clamp_min(-math.log(first_noise))
     if first_noise is not None and (spacing == "steps" or float(start) >= float(snr[cleanest])):
@@ -179,7 +172,7 @@ def visited(
             f"there are {process.steps - cleanest} steps with at least that much noise; "
             f"choose less noise or fewer sampling steps",
         )
-    chosen: list[int] = []
+    timesteps: list[int] = []
     for i in range(steps):
         share = i / max(1, steps - 1)
         if spacing == "steps":
@@ -187,9 +180,9 @@ def visited(
         else:
             nearest = int((snr - (start + share * (snr[cleanest] - start))).abs().argmin())
         # Each step once, and room for those that follow.
-        nearest = min(nearest, chosen[-1] - 1) if chosen else process.steps - 1  # pure noise first
-        chosen.append(max(nearest, cleanest + steps - 1 - i))
-    return chosen
+        nearest = min(nearest, timesteps[-1] - 1) if timesteps else process.steps - 1  # pure noise first
+        timesteps.append(max(nearest, cleanest + steps - 1 - i))
+    return timesteps
 
 
 PART = 2**21
@@ -197,17 +190,11 @@ PART = 2**21
 
 
 def unit_noise(shape: Sequence[int], device: torch.device, generator: torch.Generator | None = None) -> Tensor:
-    """Unit Gaussian noise, drawn by all threads of a processor; the number of threads does not change the numbers.
-
-    Args:
-        shape: the shape of the noise.
-        device: where to draw.
-        generator: source of the random numbers; torch's global one if None.
-    """
+    """Unit Gaussian noise, drawn by all threads of a processor; the number of threads does not change the numbers."""
     if device.type != "cpu":
         return torch.randn(*shape, device=device, generator=generator)
     # PyTorch draws on a processor with one thread, which with 70 000 coordinates a frame is a good part of a training
-    # step: 0.22 s of 3.67 s, and 0.08 s here (tools/benchmarks/RESULTS.md). Many streams, whose seeds come from the
+    # step: 0.22 s of 3.67 s, and 0.08 s here (tools/benchmarks/RESULTS.md). Many streams, with seeds from the
     # generator, are drawn in parallel instead.
     noise = torch.empty(*shape)
     parts = torch.split(noise.view(-1), PART)
@@ -241,8 +228,8 @@ class Sampler(ABC):
         spacing: how they are spread over the process, see :func:`visited`.
         last_noise: noise left at the last of them, see :func:`visited`.
         first_noise: noise from which ``log_snr`` is spread, see :func:`visited`.
-        spread: what the noise is multiplied by where the first step goes on from it, and the distance of the result
-            from the first prediction, which is the mean; few steps vary too little.
+        spread: factor of the noise where the first step goes on from it, and of the distance of the result from the
+            first prediction, which is the mean; few steps vary too little.
 
     Attributes:
         timesteps: the steps visited, counted from 0, from the process's last (pure noise) downwards.
@@ -286,14 +273,7 @@ class Sampler(ABC):
         noise: NoiseSource = torch.randn_like,
         progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
     ) -> Float[Tensor, "*shape"]:
-        """Denoise ``start`` to clean motion.
-
-        Args:
-            denoise: predicts the clean motion from the noisy one.
-            start: unit Gaussian noise.
-            noise: source of the noise that stochastic samplers add.
-            progress: wraps the iteration over steps, e.g. in a progress bar.
-        """
+        """Denoise ``start`` to clean motion."""
         # Solvers of a higher order extrapolate from earlier predictions instead of calling the network again, which is
         # why the predictions and not the states are kept.
         noisy = mean = start
@@ -314,7 +294,7 @@ class Sampler(ABC):
         Args:
             i: which of the timesteps.
             noisy: the motion there.
-            predictions: the latest clean predictions, at most :attr:`memory`; the last one is that of this step.
+            predictions: the latest clean predictions, at most :attr:`memory`; the last one is this step's.
             noise: where a stochastic sampler takes new noise from.
         """
 
@@ -359,13 +339,13 @@ class DdimSampler(Sampler):
         """DDIM's update between any two steps of the process (Song et al. 2021, eq. 12 and 16)."""
         # ᾱ of the two steps really visited. Libraries often go back by N // steps instead, which is not the distance to
         # the next step where ``steps`` does not divide N; the noise level is then wrong throughout.
-        now, then = self.signal[i], self.signal[i + 1]
+        signal_now, signal_after = self.signal[i], self.signal[i + 1]
         clean = predictions[-1]
         # The noise that the motion holds if the prediction is right. The update keeps as much of it as the next step
         # allows, and replaces the share η² of the posterior's variance by new noise (σ² of eq. 16).
-        direction = (noisy - now**0.5 * clean) / (1 - now) ** 0.5
-        variance = self.eta**2 * (1 - then) / (1 - now) * (1 - now / then)
-        mean = then**0.5 * clean + max(1 - then - variance, 0.0) ** 0.5 * direction
+        direction = (noisy - signal_now**0.5 * clean) / (1 - signal_now) ** 0.5
+        variance = self.eta**2 * (1 - signal_after) / (1 - signal_now) * (1 - signal_now / signal_after)
+        mean = signal_after**0.5 * clean + max(1 - signal_after - variance, 0.0) ** 0.5 * direction
         return mean if variance == 0 else mean + variance**0.5 * noise(noisy)
 
 
@@ -431,10 +411,10 @@ class DpmSolverSampler(Sampler):
     ) -> None:
         super().__init__(process, steps, spacing, last_noise, first_noise, spread)
         self.order = order
-        # Without the clean end, whose time λ is infinite; the last update returns the prediction and needs none.
+        # Without the clean end, where the time λ is infinite; the last update returns the prediction and needs none.
         signal = self.signal[:-1]
-        self.signal_rate = [math.sqrt(kept) for kept in signal]
-        self.noise_rate = [math.sqrt(1 - kept) for kept in signal]
+        self.signal_rate = [math.sqrt(value) for value in signal]
+        self.noise_rate = [math.sqrt(1 - value) for value in signal]
         # λ, half the logarithm of the signal-to-noise ratio, is the solver's time.
         self.time = [math.log(a / s) for a, s in zip(self.signal_rate, self.noise_rate, strict=True)]
 

@@ -35,12 +35,12 @@ def regions_of(assets: Assets) -> dict[str, Region]:
 class ScoredCorpus:
     """What scoring needs of a corpus in addition to its clips.
 
-    Scores are those of vertices, also of channels, which their rig decodes; without a rig, those of channels.
+    Vertices are scored, also for channels, which their rig decodes; without a rig, channels are.
 
     Args:
         data: the corpus; None where batches are scored by the protocol alone.
         assets: its templates, regions and rig.
-        speakers: who are told apart, by number; everybody with a template if None.
+        speakers: who are told apart, by number; all with a template if None.
     """
 
     def __init__(
@@ -57,10 +57,10 @@ class ScoredCorpus:
         return MeanFaces(self.data)
 
     def context(self, needs: Collection[str], device: torch.device) -> Context:
-        """What the corpus has for metrics, and why it lacks the rest.
+        """Inputs of metrics that the corpus has, and reasons why it lacks the rest.
 
         Args:
-            needs: what the metrics need, of which the dear ones are made only where they are among it.
+            needs: the metrics' inputs; the dear ones are made only where they are among them.
             device: where motion is generated.
         """
         data, assets = self.data, self.assets
@@ -73,7 +73,7 @@ class ScoredCorpus:
             "identities": {"n_identities": len(self.speakers)},
             "time": {"hardware": device_name(device)},
         }
-        missing = {
+        reasons = {
             "lip_pairs": "the corpus has no regions/inner_lip_pairs.txt",
             "lid_pairs": f"the corpus has no {EYELID_PAIRS}; list pairs of an upper and a lower eyelid vertex there, "
             "or in the file that data.eyelid_pairs names",
@@ -92,34 +92,22 @@ class ScoredCorpus:
                     raise FaceDiffError("no rig decodes the channels, and speakers are told apart by their faces")
                 has["gallery"] = {"gallery": speaker_gallery(data, self.speakers, assets)}
             except FaceDiffError as error:
-                missing["gallery"] = str(error)
+                reasons["gallery"] = str(error)
         if (data.root / "phonemes").is_dir():
             has["closures"] = {}
         if not assets.space.is_vertices:
             has["channels"] = {}
         has |= {need: {} for need in CONVERSATION if (data.root / need).is_dir()}
-        return Context(has, missing, channel_regions(assets.space))
+        return Context(has, reasons, channel_regions(assets.space))
 
     def decoded(self, motion: Tensor, names: Sequence[str]) -> Tensor:
-        """Offsets of clips, (batch, …, points, dims), as those of what is scored.
-
-        Args:
-            motion: of the corpus's points.
-            names: whose it is.
-        """
+        """Offsets of clips, (batch, …, points, dims), as in the scored motion."""
         if self.assets.rig is None:
             return motion
         return torch.stack([self.assets.to_scored(one, name) for one, name in zip(motion, names, strict=True)])
 
     def inputs(self, motion: Tensor, truth: Tensor, batch: Batch, needs: Collection[str]) -> dict[str, Any]:
-        """What metrics may read of a batch, by the name under which they take it; see :data:`facediff.metrics.NEEDS`.
-
-        Args:
-            motion: decoded offsets.
-            truth: the same of the truth.
-            batch: the clips.
-            needs: what the metrics need.
-        """
+        """Inputs of metrics from a batch, by the names of their arguments; see :data:`facediff.metrics.NEEDS`."""
         templates = batch.template
         if self.assets.rig is not None:
             templates = torch.stack([self.assets.scored.template(name) for name in batch.identity_names])
@@ -151,6 +139,6 @@ class ScoredCorpus:
         return [] if file is None else closures(read_phonemes(file), self.data.frame_rate)
 
     def _conversation(self, folder: str, batch: Batch) -> list[Tensor]:
-        """What a conversation's folder holds of each clip, of the frames that are read of the motion."""
+        """A conversation folder's recordings of each clip, for the frames that are read of the motion."""
         root, stride = self.data.root, self.data.corpus.stride
         return [torch.from_numpy(conversation_file(root, folder, clip, stride)) for clip in batch.names]

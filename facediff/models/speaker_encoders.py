@@ -1,4 +1,4 @@
-"""What is known of a speaker: identity encoders (dual-path paper, section 1.3.2) and style encoders (section 1.3.1).
+"""Encoders of a speaker: identity encoders (dual-path paper, section 1.3.2) and style encoders (section 1.3.1).
 
 An identity encoder turns a label into the static feature F_id, a style encoder turns a reference motion into the
 dynamic feature F_dyn. The ablation ``none`` of either contributes nothing.
@@ -51,11 +51,7 @@ class IdentityEncoder(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identity_dim"]:
-        """Encode.
-
-        Args:
-            identity: index into the training identities, or −1 for an unseen speaker.
-        """
+        """Encode."""
 
 
 class IdentityEncoderFactory(Protocol):
@@ -330,7 +326,7 @@ class LstmStyle(StyleEncoder):
 
     def states(self, reference: Frames, mask: FrameMask) -> Float[Tensor, "batch frames style_dim"]:
         """The state after each frame: it depends on that frame and those before it alone."""
-        # Padding comes after all valid frames; zeros keep what is not finite there out of the gradient.
+        # Padding comes after all valid frames; zeros keep NaN and infinity there out of the gradient.
         return all_states(self.lstm, reference.masked_fill(~mask[..., None], 0.0))
 
 

@@ -1,8 +1,8 @@
 """Pretrained wav2vec 2.0, HuBERT and WavLM, base and large, as the published methods of the field use them.
 
 The methods differ in where they leave the network's 50 steps a second for the motion's frames
-(:data:`~facediff.models.audio_encoders.StepRule`), in the constant by which speech is standardised, and in what is
-frozen; the network is the same. Its convolutions are frozen in all of them.
+(:data:`~facediff.models.audio_encoders.StepRule`), in the constant by which speech is standardised, and in the frozen
+part; the network is the same. Its convolutions are frozen in all of them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import (
     Features,
     FrozenEncoder,
@@ -23,6 +22,7 @@ from facediff.models.audio_encoders import (
     Waves,
     by_length,
     fingerprint,
+    frozen_depth,
     load_typed,
     skipped,
     spec_augmented,
@@ -38,10 +38,10 @@ NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
 
 @audio_encoder.register("wav2vec2")
 class Wav2Vec2Encoder(FrozenEncoder):
-    """Pretrained wav2vec 2.0, HuBERT or WavLM, base or large; all but its convolutions is fine-tuned.
+    """Pretrained wav2vec 2.0, HuBERT or WavLM, base or large; all but its convolutions are fine-tuned.
 
     The published methods that facediff has (FaceFormer and others) encode speech by it; a model of facediff's own
-    may as well. ``hubert`` is the encoder that keeps more of the network frozen, whose frozen layers run once a clip.
+    may as well. ``hubert`` is the encoder that keeps more of the network frozen; frozen layers run once a clip.
 
     Args:
         dim: channels of the result, by a linear map of the hidden states; the hidden states as they are if None. Given
@@ -80,15 +80,12 @@ class Wav2Vec2Encoder(FrozenEncoder):
         settings = self.network.config
         settings.apply_spec_augment, settings.layerdrop = spec_augment, layer_drop
         self.epsilon, self.edges, self.do_normalize = epsilon, edges, do_normalize
-        depth = len(self.network.encoder.layers)
-        if frozen_layers > depth:
-            raise ArgumentError({"frozen_layers": frozen_layers}, f"this network has {depth} layers; −1 freezes all")
-        self._freeze(depth if frozen_layers < 0 else frozen_layers, everything=frozen_layers < 0)
+        self._freeze(frozen_depth(self.network, frozen_layers), everything=frozen_layers < 0)
         self.out = None if dim is None else nn.Linear(settings.hidden_size, dim)
         self.width: int = settings.hidden_size if dim is None else dim
 
     def checkpoint_init_args(self) -> dict[str, Any]:
-        """What a checkpoint stores in place of ``source``: the configuration as plain data."""
+        """The configuration as plain data, which a checkpoint stores in place of ``source``."""
         return {"config": self.network.config.to_dict()}
 
     def _freeze(self, layers: int, *, everything: bool) -> None:
@@ -107,7 +104,7 @@ class Wav2Vec2Encoder(FrozenEncoder):
             mask.requires_grad_(False)
 
     def convolutions(self) -> tuple[tuple[int, int], ...]:
-        """Those of the network's own configuration."""
+        """Kernels and strides in the network's configuration."""
         settings = self.network.config
         return tuple(zip(settings.conv_kernel, settings.conv_stride, strict=True))
 
@@ -121,14 +118,14 @@ class Wav2Vec2Encoder(FrozenEncoder):
 
     @torch.no_grad()
     def frozen_features(self, audio: Waves, audio_lengths: Lengths) -> tuple[Features, Lengths]:
-        """What the convolutions give, at 50 steps a second."""
+        """Output of the convolutions, at 50 steps a second."""
         wave = self.standardise(audio, audio_lengths, self.epsilon) if self.do_normalize else audio
         return by_length(wave, audio_lengths, self._convolve)
 
     def _convolve(self, wave: Tensor) -> Tensor:
         # At least one step, however short the speech is.
-        heard = with_edges(wave) if self.edges else nn.functional.pad(wave, (0, max(0, 400 - wave.shape[1])))
-        features: Tensor = self.network.feature_extractor(heard).transpose(1, 2)
+        padded = with_edges(wave) if self.edges else nn.functional.pad(wave, (0, max(0, 400 - wave.shape[1])))
+        features: Tensor = self.network.feature_extractor(padded).transpose(1, 2)
         return features
 
     def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
@@ -156,17 +153,17 @@ class Wav2Vec2Encoder(FrozenEncoder):
         return hidden if self.out is None else self.out(hidden)
 
     def hidden_of(
-        self, wave: Waves, steps: int | None = None, *, most: int | None = None
+        self, wave: Waves, steps: int | None = None, *, max_steps: int | None = None
     ) -> Float[Tensor, "batch steps width"]:
         """Hidden states of waves that the caller has standardised and filled up, all of one length.
 
         Args:
             wave: speech at 16 kHz.
-            steps: what the convolutions give is interpolated to so many steps before the Transformer runs, each in its
+            steps: the convolutions' output is interpolated to so many steps before the Transformer runs, each in its
                 own stretch of time; as many as they give if None.
-            most: steps of theirs that are used before that; all if None.
+            max_steps: steps of theirs that are used before that; all if None.
         """
-        features = self.network.feature_extractor(wave).transpose(1, 2)[:, :most]
+        features = self.network.feature_extractor(wave).transpose(1, 2)[:, :max_steps]
         if steps is not None and features.shape[1] != steps:
             features = nn.functional.interpolate(features.transpose(1, 2), size=steps, mode="linear").transpose(1, 2)
         hidden = self.hidden_states(features)
@@ -179,7 +176,7 @@ class Wav2Vec2Encoder(FrozenEncoder):
         hidden = network.feature_projection(features)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # wav2vec 2.0 gives its normalised input as well
         hidden = spec_augmented(network, hidden)
-        # transformers' own forward pass written out, since it cannot be entered behind the convolutions, whose result
+        # transformers' own forward pass written out, since it cannot be entered behind the convolutions; their result
         # is resampled or cached. The base networks normalise here, the large ones (``do_stable_layer_norm``) after the
         # last layer.
         hidden = hidden + encoder.pos_conv_embed(hidden)

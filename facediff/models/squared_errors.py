@@ -67,39 +67,39 @@ class _SquaredErrors(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         # In mixed precision the prediction may be in half precision, which an error and a sum must not be.
         errors = torch.empty_like(predicted, dtype=torch.result_type(predicted, truth))
-        both, sums = neighbours(mask), errors.new_zeros(2, len(errors))
+        pairs, sums = neighbours(mask), errors.new_zeros(2, len(errors))
         for clip, error in enumerate(errors):
             torch.sub(predicted[clip], truth[clip], out=error)
-            # Chosen, not multiplied: padding may hold what is not finite.
+            # Chosen, not multiplied: padding may hold NaN and infinity.
             error.masked_fill_(~mask[clip], 0.0)
             if columns is not None:
                 error *= columns
             sums[0, clip] = _square_sum(error)
-            sums[1, clip] = _square_sum(_changes(error, both[clip]))
-        ctx.save_for_backward(errors, both)
+            sums[1, clip] = _square_sum(_changes(error, pairs[clip]))
+        ctx.save_for_backward(errors, pairs)
         position, change = sums.sum(1)
         return position, change
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, of_position: Tensor, of_change: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401, D102
-        errors, both = ctx.saved_tensors
+        errors, pairs = ctx.saved_tensors
         slopes = torch.empty_like(errors)
         # Zero where a loss has no term of changes, which are then not looked at again.
         changing = errors.device.type != "cpu" or of_change.item() != 0
         for clip, slope in enumerate(slopes):
             torch.mul(errors[clip], 2 * of_position, out=slope)
             if changing:
-                change = _changes(errors[clip], both[clip]).mul_(2 * of_change)
+                change = _changes(errors[clip], pairs[clip]).mul_(2 * of_change)
                 # A difference x_{t+1} − x_t passes its gradient to both frames, with opposite signs.
                 slope[1:] += change
                 slope[:-1] -= change
         return slopes, None, None, None
 
 
-def _changes(error: Tensor, both: Tensor) -> Tensor:
+def _changes(error: Tensor, pairs: Tensor) -> Tensor:
     """Changes of a clip's error between valid neighbours (T − 1, ...); 0 elsewhere."""
-    return (error[1:] - error[:-1]).mul_(both)
+    return (error[1:] - error[:-1]).mul_(pairs)
 
 
 def _square_sum(rows: Tensor) -> Tensor:

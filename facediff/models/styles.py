@@ -1,6 +1,6 @@
-"""A speaking style from what was typed after ``--style``: a clip's name, a file, or a weighted mixture of several.
+"""A speaking style from the text after ``--style``: a clip's name, a file, or a weighted mixture of several.
 
-What was typed is split into names with weights (:mod:`facediff.animation.style_files`); each name becomes a reference
+The text is split into names with weights (:mod:`facediff.animation.style_files`); each name becomes a reference
 motion or a style vector; a motion file is brought to offsets from its speaker's neutral face, and checked against the
 face that it is taken for. Libraries are imported inside the functions, so that splitting alone costs nothing.
 """
@@ -24,7 +24,7 @@ from facediff.animation.style_files import (
     vector_in,
     with_layout,
 )
-from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.errors import OptionError, choices
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,45 +38,42 @@ if TYPE_CHECKING:
 
     Recorded = Animation | ParameterClip | npt.NDArray[np.floating] | Tensor
     StyleLike = str | Path | Mapping[str, float] | Recorded | Reference | Style
-    """What a style may be given as in Python, see :func:`style_from`."""
+    """Forms of a style in Python, see :func:`style_from`."""
 
 MEDIAN = "median"
 """Instead of a template's file: the median of the motion's own frames."""
 
 
 def read_styles(
-    words: str, identity: str, model: AnimationModel, *, template: str | Path | None = None
+    text: str, identity: str, model: AnimationModel, *, template: str | Path | None = None
 ) -> Reference | Style:
     """The style that the words of ``--style`` ask for.
 
     Args:
-        words: one style as :func:`read_style` takes it, or several with weights, ``a.npy:0.3,b.npy:0.7``; without
+        text: one style as :func:`read_style` takes it, or several with weights, ``a.npy:0.3,b.npy:0.7``; without
             weights all count alike. A mixture is the weighted mean of the model's style vectors. Weights may be
             negative, which leads away from a style; they are divided by their sum.
-        identity: whose face is animated.
+        identity: the animated face.
         model: gives the style vectors.
-        template: neutral face of the speaker whose motion the .npy files hold, or ``median``.
+        template: neutral face of the speaker in the .npy files, or ``median``.
     """
     import torch
 
     from facediff.models import Style
     from facediff.models.inference import named
 
-    own = model.own_styles()
-    if not own and not style_width(model):
-        raise OptionError.naming(
-            f"{{style}} {words}: this checkpoint was trained without a dynamic style, so a style would change nothing; "
-            f"omit {{style}}"
-        )
-    parts = split_styles(words, [*own, *(reference.clip for reference in model.assets.references.values())])
+    trained = model.own_styles()
+    if not trained:
+        refuse_without_styles(model)
+    parts = split_styles(text, [*trained, *(reference.clip for reference in model.assets.references.values())])
     if len(parts) == 1:
         # A weight of one style would have to mean a distance from some other style, and there is none.
         if parts[0].weight not in (None, 1.0):
             raise OptionError.naming(
-                f"{{style}} {words}: one style alone cannot be weighted; mix it with another one (A:0.3,B:0.7)"
+                f"{{style}} {text}: one style alone cannot be weighted; mix it with another one (A:0.3,B:0.7)"
             )
         return read_style(parts[0].name, identity, model, template=template)
-    shares = normalised(words, [part.weight for part in parts])
+    shares = normalised(text, [part.weight for part in parts])
     styles = [read_style(part.name, identity, model, template=template) for part in parts]
     # Vectors are mixed, not motions: two motions averaged frame by frame cancel each other where they differ in timing.
     vector = torch.stack([share * vector_of(s, model) for share, s in zip(shares, styles, strict=True)]).sum(0)
@@ -85,16 +82,16 @@ def read_styles(
 
 
 def style_from(
-    given: StyleLike, identity: str, model: AnimationModel, *, template: str | Path | None = None
+    source: StyleLike, identity: str, model: AnimationModel, *, template: str | Path | None = None
 ) -> Reference | Style:
     """The style that was given in Python.
 
     Args:
-        given: the words of ``--style``; a path; names or paths with their weights, ``{"F1_e03": 0.4, "M2_e05": 0.6}``;
+        source: the words of ``--style``; a path; names or paths with their weights, ``{"F1_e03": 0.4, "M2_e05": 0.6}``;
             a motion as an animation or as an array (T, V, 3) of absolute vertices; of a model of channels also one of
             :func:`facediff.spaces.files.read_parameters`; a style vector (S,) of :func:`extract_style`; or what this
             function has returned.
-        identity: whose face is animated; also whose motion an array holds, unless a template is given.
+        identity: the animated face; also the speaker of an array's motion, unless a template is given.
         model: gives the style vectors.
         template: as :func:`read_styles` takes it.
     """
@@ -102,18 +99,24 @@ def style_from(
     from facediff.models import Style
     from facediff.spaces.files import ParameterClip
 
-    if isinstance(given, Reference | Style):
-        return given
-    if not isinstance(given, Mapping | str | Path) and not style_width(model):
-        raise OptionError.naming(
-            "{style}: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
-        )
-    style = style_given(given, vertices=model.assets.space.is_vertices)
+    if isinstance(source, Reference | Style):
+        return source
+    if not isinstance(source, Mapping | str | Path):
+        refuse_without_styles(model)
+    style = style_given(source, vertices=model.assets.space.is_vertices)
     if isinstance(style, str):
         return read_styles(style, identity, model, template=template)
     if isinstance(style, ParameterClip):
         return style_of_channels(style, identity, model)
     return style_of(style, identity, model, template=template)
+
+
+def refuse_without_styles(model: AnimationModel) -> None:
+    """Refuse a style for a model that has none."""
+    if not style_width(model):
+        raise OptionError.naming(
+            "{style}: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
+        )
 
 
 def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:
@@ -150,21 +153,15 @@ def extract_style(clips: Sequence[StyleLike], identity: str, model: AnimationMod
 
     Args:
         clips: motions, as :func:`read_style` takes them, or :func:`style_from` other things than words.
-        identity: whose motion it is, where a file's name does not say it.
+        identity: the motion's speaker, where a file's name does not say it.
         model: gives the style vectors; S is 0 if it was trained without styles.
     """
     import torch
-
-    from facediff.models import Style
 
     styles = [
         read_style(str(clip), identity, model) if isinstance(clip, str | Path) else style_from(clip, identity, model)
         for clip in clips
     ]
-    for clip, style in zip(clips, styles, strict=True):
-        if isinstance(style, Style):
-            name = clip if isinstance(clip, str | Path) else style.name
-            raise FaceDiffError(f"{name}: is a style vector already; give a motion (frames, vertices, 3)")
     return torch.stack([vector_of(style, model) for style in styles]).mean(0)
 
 
@@ -181,19 +178,19 @@ def read_style(
 
     Args:
         style: the file, or the name of a clip, of an identity (its usual style), or of a style that the model has.
-        identity: whose face is animated.
+        identity: the animated face.
         model: the trained model.
-        template: neutral face of the speaker whose motion an array holds, or ``median``.
+        template: neutral face of the speaker in the array, or ``median``.
     """
-    own = model.own_styles()
-    if own:
+    trained = model.own_styles()
+    if trained:
         # Such a model has no style encoder: there is nothing to make a style of motion with.
-        if style not in own:
+        if style not in trained:
             raise OptionError.naming(
                 f"{{style}} {style}: {type(model).__name__} takes no motion as a style, but a training identity or a "
-                f"mixture of several (A:0.3,B:0.7): {choices(style, own)}"
+                f"mixture of several (A:0.3,B:0.7): {choices(style, trained)}"
             )
-        return own[style]
+        return trained[style]
     is_file = style.endswith(FILES)
     if not is_file:
         if style in model.styled_identities():  # as the styles of an exported folder are named
@@ -212,7 +209,7 @@ def read_style(
 def style_of(
     opened: StyleFile, identity: str, model: AnimationModel, *, template: str | Path | None = None
 ) -> Reference | Style:
-    """The style in a motion or a vector, however it was obtained; the arguments are those of :func:`read_style`."""
+    """The style in a motion or a vector, however it was obtained; arguments as of :func:`read_style`."""
     import torch
 
     from facediff.animation import metres_per_unit
@@ -237,7 +234,7 @@ def style_of(
     return Reference(path.stem, offsets)
 
 
-def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
+def recorded_parameters(text: str, frame_rate: float) -> ParameterClip | None:
     """As :func:`facediff.animation.parameter_styles.recorded_parameters`, and ARTalk's style clips (``.pt``)."""
     import numpy as np
 
@@ -245,9 +242,9 @@ def recorded_parameters(words: str, frame_rate: float) -> ParameterClip | None:
     from facediff.spaces.files import ParameterClip
     from facediff.spaces.layouts import find_layout
 
-    path, stated = with_layout(words)
+    path, stated = with_layout(text)
     if path.suffix != ".pt" or not path.is_file():
-        return parameter_styles.recorded_parameters(words, frame_rate)
+        return parameter_styles.recorded_parameters(text, frame_rate)
     import torch
 
     from facediff.utils.torch_files import load_tensors
@@ -303,15 +300,15 @@ def corpus_clip(name: str, model: AnimationModel) -> StyleFile:
 
 
 def face_of_array(
-    opened: StyleFile, identity: str, model: AnimationModel, given: str | Path | None
+    opened: StyleFile, identity: str, model: AnimationModel, template: str | Path | None
 ) -> tuple[Tensor, str | None, float]:
     """The neutral face of a bare array's speaker, who that is taken to be (None for a given face), and its frame rate.
 
     Args:
         opened: the array.
         identity: the speaker, if the file's name contains no known one.
-        model: its checkpoint's templates are known, and those of the corpus folder that the file lies in.
-        given: a template that was given, or ``median``.
+        model: its checkpoint's templates are known, and the templates of the corpus folder that the file lies in.
+        template: a template that was given, or ``median``.
     """
     from facediff.data import SpeechMotionDataModule
     from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
@@ -319,19 +316,19 @@ def face_of_array(
 
     path, assets, source = opened.path, model.assets, model.data_source
     templates, rate = dict(assets.templates), assets.frame_rate
-    # A file below a corpus folder is one of that corpus's clips, whose templates and frame rate lie next to it.
+    # A file below a corpus folder is one of that corpus's clips; templates and frame rate lie next to it.
     in_corpus = path.resolve().parent.name in MOTION_FOLDERS
     if in_corpus:
         root = path.resolve().parent.parent
         if (root / "templates.pkl").is_file():
             templates |= read_templates(root / "templates.pkl", assets.n_vertices)
         module = find_class(corpus, str(source.get("class_path")), SpeechMotionDataModule)
-        usual = module.stored_frame_rate if module is not None and str(root) == source.get("root") else None
-        rate = float(read_manifest(root).get("frame_rate") or usual or rate)
-    named = path.stem.split("_condition_")[0].rpartition("_")[0]
-    if given is not None and not (in_corpus and named in templates):
-        return given_face(given, opened, assets), None, rate
-    whose = next((name for name in (named, identity) if name in templates), None)
+        frame_rate = module.stored_frame_rate if module is not None and str(root) == source.get("root") else None
+        rate = float(read_manifest(root).get("frame_rate") or frame_rate or rate)
+    stem = path.stem.split("_condition_")[0].rpartition("_")[0]
+    if template is not None and not (in_corpus and stem in templates):
+        return given_face(template, opened, assets), None, rate
+    whose = next((name for name in (stem, identity) if name in templates), None)
     return assets.template(identity) if whose is None else templates[whose], whose or identity, rate
 
 
@@ -364,25 +361,14 @@ def given_face(template: str | Path, opened: StyleFile, assets: Assets) -> Tenso
 
 
 def check_face(path: Path, offsets: Tensor, assets: Assets, whose: str | None) -> None:
-    """Refuse a motion that is not of the face whose template was subtracted; it would pass for an odd style.
-
-    Args:
-        path: for the message.
-        offsets: (T, V, 3) from the template.
-        assets: of the checkpoint.
-        whose: the speaker that the motion is taken for; None where the template came with the motion.
-    """
+    """Refuse a motion if another face's template was subtracted; it would pass for an odd style."""
     stillness = stillness_of([reference.motion.float().numpy() for reference in assets.references.values()])
     if stillness is None or not stillness.another_face(offsets.numpy()):
         return
-    if whose is None:
-        raise OptionError.naming(
-            f"{{style}} {path}: does not lie on its template: the head moves, or the template is another person's or "
-            f"in another unit; give that person's own, and a head that keeps still (`facediff data import-person` does "
-            f"it)"
-        )
+    reason = "the head moves, or the template is another person's or in another unit"
+    if whose is not None:
+        reason = f"it is not {whose}'s; name the file <identity>_<clip>.npy with an identity of the checkpoint"
     raise OptionError.naming(
-        f"{{style}} {path}: is not a motion of {whose}'s face, so it must be another person's; give that person's "
-        f"neutral face with {{style_template}}, or name the file <identity>_<clip>.npy with an identity that the "
-        f"checkpoint knows ({', '.join(sorted(assets.templates))})"
+        f"{{style}} {path}: does not lie on its template: {reason}, or give that person's own with {{style_template}}, "
+        f"and a head that keeps still (`facediff data import-person` does it)"
     )

@@ -1,8 +1,8 @@
 """Reading speech, in every form that Python and the command line give it in, as samples (S,) at 16 kHz.
 
 From top to bottom: files of any common format, rate and number of channels; stretches of a corpus's files; recordings
-to animate, which keep their own sound, with :func:`speech_of` for whatever Python has; pieces of a stream; and whether
-a file is whole. Nothing here needs PyTorch.
+to animate, which keep their own sound, with :func:`speech_of` for arrays and files in Python; pieces of a stream;
+and whether a file is whole. Nothing here needs PyTorch.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CONTAINERS = (
     *(".flv", ".m4a", ".mp4", ".mov", ".mkv", ".webm", ".avi", ".aac"),
     *(".mpg", ".mpeg", ".m4v", ".ts", ".mts", ".wmv", ".3gp"),
 )
-"""Videos and similar containers, whose sound PyAV extracts."""
+"""Videos and similar containers; PyAV extracts their sound."""
 
 DEMUXERS = "flv,mov,mp4,m4a,matroska,webm,avi,aac,mpegts,mpeg,mp3,ogg,wav,flac,aiff,w64,caf"
 """What FFmpeg may take such a file for: not a playlist, which names other files and addresses to be opened."""
@@ -55,6 +55,9 @@ BLOCK = 1 << 18
 
 HOLE = 0.05
 """Seconds of sound that may be missing between two packets of a video before they count as lost."""
+
+LENGTH_IS_KNOWN = ("WAV", "WAVEX", "RF64", "AIFF")
+"""Formats whose number of samples follows from the size of the file."""
 
 UNKNOWN = 1 << 62
 """libsndfile gives a length above this where a stream does not tell it."""
@@ -72,7 +75,7 @@ FULL_SCALE = {"uint8": (128.0, 128), "int16": (32768.0, 0), "int32": (2.0**31, 0
 def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
     """Read a recording, or the sound of a video, as (S,) float32 mono at 16 kHz.
 
-    Channels are averaged; another rate is resampled by soxr (high quality). What the file declares is checked before
+    Channels are averaged; another rate is resampled by soxr (high quality). The file's header is checked before
     anything is decoded, and decoding ends where the speech becomes too long.
 
     Args:
@@ -85,8 +88,8 @@ def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[
 def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
     """Read a recording as :func:`read_speech` does, at its own rate from 16 to 48 kHz; the samples and the rate."""
     samples, rate = _read(path, None)
-    own = _rate_to_play(rate)
-    return _resampled(_checked(samples, str(path)), rate, own), own
+    playable = _rate_to_play(rate)
+    return _resampled(_checked(samples, str(path)), rate, playable), playable
 
 
 def _read(path: Path, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
@@ -122,7 +125,7 @@ def _rate_to_play(rate: float) -> int:
 
 def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.floating]:
     """Mono, where all samples are in range."""
-    peak = float(np.abs(samples).max(initial=0.0))
+    peak = float(np.maximum(samples.max(initial=0.0), -samples.min(initial=0.0)))  # without a copy of all samples
     if not len(samples) or not peak <= LOUDEST:
         raise FaceDiffError(
             f"{name}: holds no samples, or up to {peak:g}; expected speech of finite numbers with a full scale of 1"
@@ -146,20 +149,15 @@ def resampler(rate: int) -> Callable[[npt.NDArray[np.float32], bool], npt.NDArra
     return lambda piece, last: stream.resample_chunk(piece, last=last)
 
 
-def _check_length(path: object, seconds: float, most: float | None) -> None:
-    """Refuse speech that is longer than an option allows, by what a file declares and by what is decoded of it."""
-    if most is not None and seconds > most:
-        raise OptionError("max_seconds", f"{path} lasts {seconds:.0f} s; cut it or raise the limit", f"{most:g}")
+def _check_length(path: object, seconds: float, limit: float | None) -> None:
+    """Refuse speech that is longer than an option allows, by a file's header and by the decoded samples."""
+    if limit is not None and seconds > limit:
+        raise OptionError("max_seconds", f"{path} lasts {seconds:.0f} s; cut it or raise the limit", f"{limit:g}")
 
 
 @contextmanager
 def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
-    """A ``soundfile.SoundFile``.
-
-    Args:
-        source: the file, or its content.
-        name: what messages call a content.
-    """
+    """A ``soundfile.SoundFile``."""
     import soundfile
 
     path = source if isinstance(source, Path) else Path(name)
@@ -175,29 +173,37 @@ def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
 
 
 def _reason(path: Path, error: Exception) -> str:
-    """What a library says of a file, without the name that begins the message already."""
+    """A library's message about a file, without the name that begins it already."""
     return brief(str(error).replace(f"Error opening {os.fsencode(path)!r}: ", "").replace(str(path), path.name))
 
 
-def _decoded(file: Any, path: object, most: float | None) -> tuple[npt.NDArray[np.float32], int]:  # noqa: ANN401
+def _decoded(file: Any, path: object, limit: float | None) -> tuple[npt.NDArray[np.float32], int]:  # noqa: ANN401
     """All samples (S,) of a ``soundfile.SoundFile``, its channels averaged."""
     declared, rate = int(file.frames), int(file.samplerate)
-    known = 0 <= declared < UNKNOWN
-    _check_length(path, declared / rate if known else 0, most)
+    counted_frames = 0 <= declared < UNKNOWN
+    _check_length(path, declared / rate if counted_frames else 0, limit)
     parts, decoded = [], 0
+    # A long recording fits once into memory, not twice.
+    samples = np.empty(declared, np.float32) if counted_frames and file.format in LENGTH_IS_KNOWN else None
     while len(block := file.read(max(1, BLOCK // file.channels), dtype="float32", always_2d=True)):
+        mono = block[:, 0].copy() if file.channels == 1 else block.mean(axis=1)
+        if samples is None:
+            parts.append(mono)
+        else:
+            samples[decoded : decoded + len(mono)] = mono
         decoded += len(block)
-        _check_length(path, decoded / rate, most)
-        parts.append(block[:, 0].copy() if file.channels == 1 else block.mean(axis=1))
+        _check_length(path, decoded / rate, limit)
     # Without a frame that tells the number of frames, the length of an mp3 is an estimate.
-    if known and decoded < declared and file.format != "MP3":
+    if counted_frames and decoded < declared and file.format != "MP3":
         raise FaceDiffError(
             f"{path}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
         )
+    if samples is not None:
+        return samples, rate
     return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
 
 
-def _decode_container(path: Path, most: float | None) -> tuple[npt.NDArray[np.float32], int]:
+def _decode_container(path: Path, limit: float | None) -> tuple[npt.NDArray[np.float32], int]:
     """The first sound track of a video, (S,) mono, from the time of its first picture on."""
     with needs_extra("av", "prepare", f"extracting the sound of {path.suffix} files"):
         import av
@@ -210,7 +216,7 @@ def _decode_container(path: Path, most: float | None) -> tuple[npt.NDArray[np.fl
             track = container.streams.audio[0]
             rate = int(track.rate)
             if track.duration and track.time_base:
-                _check_length(path, float(track.duration * track.time_base), most)
+                _check_length(path, float(track.duration * track.time_base), limit)
             plain = AudioResampler(format="fltp", layout="mono", rate=rate)
             decoded, late, start, heard = 0, None, None, 0
             for frame in chain(container.decode(audio=0), [None]):  # at None, what the resampler still holds comes out
@@ -220,14 +226,14 @@ def _decode_container(path: Path, most: float | None) -> tuple[npt.NDArray[np.fl
                 if frame is not None and start is not None and frame.time is not None:
                     hole = round((frame.time - start) * rate) - heard
                     if hole > HOLE * rate:  # packets were lost: what follows stays in step with the pictures
-                        _check_length(path, (decoded + hole) / rate, most)
+                        _check_length(path, (decoded + hole) / rate, limit)
                         parts.append(np.zeros(hole, np.float32))
                         decoded, heard = decoded + hole, heard + hole
                     heard += frame.samples
                 for part in plain.resample(frame):
                     parts.append(part.to_ndarray()[0])
                     decoded += len(parts[-1])
-                _check_length(path, decoded / rate, most)
+                _check_length(path, decoded / rate, limit)
     except (av.FFmpegError, AttributeError, ValueError, TypeError, OSError) as error:  # a track may lack its rate
         raise FaceDiffError(f"{path}: its sound cannot be read ({_reason(path, error)}); convert it to .wav") from error
     if not parts or not late:
@@ -242,19 +248,19 @@ def _seconds_after_picture(container: Any, sound: float | None) -> float:  # noq
 
 
 def read_stretch(
-    path: Path, first: int, length: int, store: ArrayStore | None, whole: set[Path] | None = None
+    path: Path, first: int, length: int, store: ArrayStore | None, complete: set[Path] | None = None
 ) -> npt.NDArray[np.float32]:
     """Samples ``first`` to ``first + length`` at 16 kHz, (length,) float32, filled with zeros past the end.
 
     Of a 16 kHz mono file only these samples are read. Any other file is decoded as a whole once and kept in ``store``.
-    Files that were looked at to the end are kept in ``whole``, so that a training does so once.
+    Files that were looked at to the end are kept in ``complete``, so that a training does so once.
     """
     if not path.is_file() or not path.stat().st_size:
         return fit_length(read_speech(path), length)  # which reports what is wrong
-    if whole is None or path not in whole:
+    if complete is None or path not in complete:
         refuse_cut_short(path)
-        if whole is not None:
-            whole.add(path)
+        if complete is not None:
+            complete.add(path)
     with open_sound(path) as file:
         if file.samplerate == SAMPLE_RATE and file.channels == 1 and file.seekable():
             file.seek(min(first, file.frames))
@@ -299,10 +305,10 @@ class SpeechRecording:
     @classmethod
     def of(cls, samples: npt.NDArray[np.floating], rate: float, name: str, source: str) -> SpeechRecording:
         """Of samples (S,), full scale 1, at any rate; ``source`` is what errors call them."""
-        mono, own = _checked(samples, source), _rate_to_play(rate)
+        mono, playable = _checked(samples, source), _rate_to_play(rate)
         speech = _resampled(mono, rate, SAMPLE_RATE)
         check_speech(speech, source)
-        return cls(name, speech, speech if own == SAMPLE_RATE else _resampled(mono, rate, own), own)
+        return cls(name, speech, speech if playable == SAMPLE_RATE else _resampled(mono, rate, playable), playable)
 
 
 def read_recording(path: Path, max_seconds: float | None = None) -> SpeechRecording:
@@ -318,26 +324,26 @@ def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
 
 
 def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | None = None) -> SpeechRecording:
-    """A recording to animate, from whatever it may be given as.
+    """A recording to animate, from any form that Python has.
 
     Args:
         speech: a path; an open file; a data set's audio, ``{"array", "sampling_rate"}`` or ``{"bytes", "path"}``;
             samples as an array or a tensor; or a pair of samples and their rate, in either order.
-        rate: sample rate of an array; that of a tensor is 16 kHz if None.
+        rate: sample rate of an array; a tensor's is 16 kHz if None.
         max_seconds: refuse speech that lasts longer.
     """
     if isinstance(speech, Mapping):  # audio of a data set of the Hugging Face hub, decoded or a file
         name = Path(speech["path"]).stem if speech.get("path") else "speech"
         if "array" in speech:
             # Channels come first there; lists come of data sets without a format.
-            found = speech_of(np.asarray(speech["array"]), speech["sampling_rate"], max_seconds)
+            recording = speech_of(np.asarray(speech["array"]), speech["sampling_rate"], max_seconds)
         elif speech.get("bytes") is not None:
-            found = speech_of(io.BytesIO(speech["bytes"]), None, max_seconds)
+            recording = speech_of(io.BytesIO(speech["bytes"]), None, max_seconds)
         else:
-            found = speech_of(speech["path"], None, max_seconds)
-        return replace(found, name=name)
-    if rate is not None and (isinstance(speech, str | Path) or hasattr(speech, "read")):
-        raise FaceDiffError("rate: a recording has its own; omit it")
+            recording = speech_of(speech["path"], None, max_seconds)
+        return replace(recording, name=name)
+    if rate is not None and (isinstance(speech, str | Path | tuple) or hasattr(speech, "read")):
+        raise FaceDiffError("rate: a recording and a pair have their own; omit it")
     if isinstance(speech, str | Path):
         return read_recording(Path(speech), max_seconds)
     if hasattr(speech, "read"):
@@ -346,8 +352,6 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         with open_sound(file, path) as sound:
             return SpeechRecording.of(*_decoded(sound, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
-        if rate is not None or len(speech) != 2:
-            raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
         first, second = cast("tuple[Any, Any]", speech)
         rate_first = isinstance(first, numbers.Real)  # NumPy's as well
         speech, rate = (second, first) if rate_first else (first, second)
@@ -387,17 +391,17 @@ def mono_waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
 
 def stream_piece(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
     """A piece (n,) of a stream, which may be empty."""
-    if isinstance(chunk, bytes) and len(chunk) % 2:
-        raise FaceDiffError("chunks: one has an odd number of bytes; expected 16-bit samples")
-    samples = samples_of(chunk) if isinstance(chunk, bytes) else np.asarray(chunk)
+    odd = isinstance(chunk, bytes) and len(chunk) % 2
+    samples = samples_of(chunk) if isinstance(chunk, bytes) and not odd else np.asarray(chunk)
     if samples.ndim != 1:
-        raise FaceDiffError(f"chunks: one has the shape {np.shape(chunk)}; expected mono samples (n,)")
+        shape = f"{len(chunk)} bytes" if odd else f"the shape {np.shape(chunk)}"
+        raise FaceDiffError(f"chunks: one has {shape}; expected mono samples (n,), or bytes of 16-bit samples")
     return _checked(mono_waveform(samples, "chunks"), "chunks") if len(samples) else np.zeros(0, np.float32)
 
 
 # Decoders return the samples that they find, and only some of them say that there should be more. A recording that was
 # cut short by a full disk or a broken download would be animated as far as it goes. Programs that write to a pipe do
-# not know the length; what they put in its place is recognised, and such recordings are whole.
+# not know the length; their placeholder is recognised, and such recordings are whole.
 
 OPEN_ENDS = (range(0x7FFF_F000, 0x8000_0001), range(0xFFFF_0000, 0x1_0000_0000))
 """Sizes that programs put into a header of 32 bits when they write to a pipe (SoX and ALSA; FFmpeg)."""
@@ -407,21 +411,18 @@ CUT = "is cut short"
 
 def refuse_cut_short(path: Path) -> None:
     """Refuse a recording that ends before its container says."""
-    missing = cut_short(path)
-    if missing is not None:
+    remark = cut_short(path)
+    if remark is not None:
         raise FaceDiffError(
-            f"{path}: {CUT}: {missing}; copy it again, or convert what there is with ffmpeg if that is all you want"
+            f"{path}: {CUT}: {remark}; copy it again, or convert what there is with ffmpeg if that is all you want"
         )
 
 
 def cut_short(path: Path) -> str | None:
-    """What a recording lacks at its end; None if it is whole, or of a format whose decoder reports it.
+    """The part that a recording lacks at its end; None if it is whole, or if its format's decoder reports it.
 
     Wav, AIFF, MP4 and Ogg are checked, by their headers only; others, such as flac, are left to the decoder. Of an mp3
     nothing tells how long it should be.
-
-    Args:
-        path: the file, which must not be empty.
     """
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         head = data[:12]

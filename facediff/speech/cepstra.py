@@ -56,8 +56,8 @@ def cepstra(speech: npt.NDArray[np.floating], frames: int, frame_rate: float) ->
     energy = np.log(power @ mel_filters(N_MELS, N_FFT, 60.0, 7600.0).astype(np.float64).T + 1e-6)
     # The cosine transform of the log energies: its first coefficients describe the shape of the vocal tract, its later
     # ones the pitch, which differs between speakers.
-    place = (np.arange(N_MELS) + 0.5) * np.pi / N_MELS
-    features = energy @ np.cos(place[:, None] * np.arange(N_CEPSTRA))
+    angle = (np.arange(N_MELS) + 0.5) * np.pi / N_MELS
+    features = energy @ np.cos(angle[:, None] * np.arange(N_CEPSTRA))
     slopes = np.gradient(features, axis=0) if frames > 1 else features
     features = np.concatenate([features, slopes], axis=1)
     return np.asarray((features - features.mean(0)) / np.maximum(features.std(0), 1e-6))
@@ -65,10 +65,6 @@ def cepstra(speech: npt.NDArray[np.floating], frames: int, frame_rate: float) ->
 
 def align_features(first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     """For each frame of ``first`` the frame of ``second`` that goes with it, by dynamic time warping.
-
-    Args:
-        first: features (T, C).
-        second: features (U, C).
 
     Returns:
         indices (T,) into ``second``, never falling; where several frames go with one, the middle one.
@@ -81,6 +77,6 @@ def align_features(first: npt.NDArray[np.float64], second: npt.NDArray[np.float6
     window = round(BAND * max(len(first), len(second))) + abs(len(first) - len(second)) + 1
     _, costs = dtw_ndim.warping_paths_fast(np.ascontiguousarray(first), np.ascontiguousarray(second), window=window)
     partners: list[list[int]] = [[] for _ in first]
-    for here, there in best_path(costs):
-        partners[here].append(there)
-    return np.array([there[len(there) // 2] for there in partners], np.int64)
+    for row, column in best_path(costs):
+        partners[row].append(column)
+    return np.array([column[len(column) // 2] for column in partners], np.int64)

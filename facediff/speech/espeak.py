@@ -88,17 +88,13 @@ _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_short), ctype
 def speak(text: str, voice: EspeakVoice) -> Utterance:
     """Speak a sentence; the same text and voice give the same samples every time.
 
-    Args:
-        text: The sentence, in English.
-        voice: The speaker's voice.
-
     Returns:
         The waveform at 16 kHz and the phonemes with their times.
     """
     library, _ = _paths()
     if _is_loaded(library):
         return _finish(*_speak_elsewhere(text, voice))
-    # ctypes prints and drops what a callback raises. Signals, such as Ctrl-C, raise in the main thread only.
+    # ctypes prints and drops exceptions of a callback. Signals, such as Ctrl-C, raise in the main thread only.
     with ThreadPoolExecutor(1) as thread:
         return _finish(*thread.submit(_speak_here, text, voice).result())
 
@@ -176,16 +172,16 @@ def _speak_here(text: str, voice: EspeakVoice) -> tuple[int, bytes, list[tuple[i
 def _speak_elsewhere(text: str, voice: EspeakVoice) -> tuple[int, bytes, list[tuple[int, str]]]:
     """Speak in a new interpreter."""
     request = json.dumps([text, voice.name, voice.rate, voice.pitch, voice.pitch_range])
-    done = subprocess.run(  # noqa: S603 - this very interpreter, no outside input
+    process = subprocess.run(  # noqa: S603 - this very interpreter, no outside input
         [sys.executable, "-m", "facediff.speech.espeak"],
         input=request.encode(),
         capture_output=True,
         check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
-    if done.returncode != 0:
-        raise FaceDiffError(f"espeak-ng failed in its own process: {done.stderr.decode(errors='replace')[-300:]}")
-    header, pcm = done.stdout.split(b"\n", 1)
+    if process.returncode != 0:
+        raise FaceDiffError(f"espeak-ng failed in its own process: {process.stderr.decode(errors='replace')[-300:]}")
+    header, pcm = process.stdout.split(b"\n", 1)
     rate, events = json.loads(header)
     return int(rate), pcm, [(int(sample), str(ipa)) for sample, ipa in events]
 

@@ -27,7 +27,7 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
         read: works as ``os.read``; half a sample at the end is dropped.
     """
     rest, first = b"", True
-    # A read of a pipe gives what is there, at least one byte, and nothing at its end.
+    # A read of a pipe gives the bytes that are there, at least one, and nothing at its end.
     while data := read(source.fileno(), max(2, round(CHUNK * rate) * 2)):
         if first and data[:4] in SOUND_FILES:
             raise FaceDiffError(
@@ -35,9 +35,9 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
                 "(ffmpeg -i FILE -f s16le -ac 1 -ar 16000 -)"
             )
         data, first = rest + data, False
-        whole = len(data) // 2 * 2
-        rest = data[whole:]
-        yield samples_of(data[:whole])
+        even = len(data) // 2 * 2
+        rest = data[even:]
+        yield samples_of(data[:even])
 
 
 def samples_of(data: bytes) -> npt.NDArray[np.float32]:

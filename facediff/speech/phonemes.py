@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.errors import FaceDiffError
+from facediff.errors import damaged
 from facediff.speech.text_grids import SILENCES, phones_in
 from facediff.utils.plain_files import read_rows
 
@@ -77,7 +77,7 @@ def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
 def read_phonemes(path: Path) -> list[TimedPhoneme]:
     """Phonemes of a table with the columns ``start``, ``end`` (seconds) and ``ipa``, and maybe ``viseme``, ``word``."""
     expected = "expected a table with the columns start, end (seconds), ipa"
-    try:
+    with damaged(path, expected):
         phonemes = [
             TimedPhoneme(
                 float(row["start"]),
@@ -88,10 +88,8 @@ def read_phonemes(path: Path) -> list[TimedPhoneme]:
             )
             for row in read_rows(path, remedy=expected)
         ]
-    except (KeyError, ValueError) as error:
-        raise FaceDiffError(f"{path}: not readable as phonemes ({error}); {expected}") from error
-    if not phonemes or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in phonemes):
-        raise FaceDiffError(f"{path}: expected phonemes whose start is not below 0 and not after their end")
+        if not phonemes or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in phonemes):
+            raise ValueError("has no phonemes, or one that starts below 0 or after its end")
     return phonemes
 
 
@@ -106,10 +104,6 @@ def closed_times(phonemes: Iterable[TimedPhoneme]) -> list[tuple[float, float]]:
 
 def closures(phonemes: Iterable[TimedPhoneme], frame_rate: float) -> list[tuple[int, int]]:
     """The frames in which the lips close for p, b and m, as `facediff.metrics.BilabialClosureRate` takes them.
-
-    Args:
-        phonemes: Of one clip.
-        frame_rate: Frames per second of its motion.
 
     Returns:
         First frame and frame after the last of each closure, in order; at least one frame each. Closures that touch
@@ -145,8 +139,6 @@ def read_alignment(path: Path) -> list[TimedPhoneme]:
 
     Labels may be IPA, also with marks, or ARPAbet with or without digits of stress.
     """
-    if not path.is_file():
-        raise FaceDiffError(f"{path}: no such file; expected a .TextGrid, or a .csv with the columns start, end, ipa")
     if path.suffix.lower() == ".textgrid":
         phonemes = [TimedPhoneme(start, end, label) for start, end, label in phones_in(path)]
     else:

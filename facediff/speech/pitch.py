@@ -55,18 +55,18 @@ def stretched(speech: Wave, ratio: float) -> Wave:
     before = GRAIN // 2 + REACH
     behind = middles[-1] + REACH + STEP + GRAIN - before - len(speech)
     padded = np.pad(np.asarray(speech, np.float32), (before, behind))
-    # The norms of all grains, so that the likest is not merely the loudest: at a ratio of 1 speech stays what it is.
+    # The norms of all grains, so that the likest is not merely the loudest: a ratio of 1 leaves speech unchanged.
     sums = np.concatenate([[0.0], np.cumsum(np.square(padded, dtype=np.float64))])
     norms = np.sqrt(np.maximum(sums[GRAIN:] - sums[:-GRAIN], 0)) + 1e-6
     out = np.zeros((count + 1) * STEP, np.float32)
-    place = REACH
+    position = REACH
     for number, middle in enumerate(middles):
         if number:
-            following = padded[place + STEP : place + STEP + GRAIN]
+            following = padded[position + STEP : position + STEP + GRAIN]
             first = middle - REACH
             alike = np.correlate(padded[first : middle + REACH + GRAIN], following, "valid")
-            place = first + int(np.argmax(alike / norms[first : middle + REACH + 1] - _DISTANCE))
-        out[number * STEP : number * STEP + GRAIN] += _FADE * padded[place : place + GRAIN]
+            position = first + int(np.argmax(alike / norms[first : middle + REACH + 1] - _DISTANCE))
+        out[number * STEP : number * STEP + GRAIN] += _FADE * padded[position : position + GRAIN]
     return out[GRAIN // 2 : GRAIN // 2 + length]
 
 

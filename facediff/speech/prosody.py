@@ -32,7 +32,7 @@ SLOW = 300
 SETTLED = 15
 """Steps of voice before anything counts as above the usual."""
 SEMITONES, DECIBELS = 4.0, 8.0
-"""What counts as a whole accent above what is usual."""
+"""The height of a whole accent above the usual value."""
 PITCH_SHARE = 0.7
 """How much of an accent is pitch; the rest is loudness."""
 ACCENT, RISE = 0.3, 0.2
@@ -40,7 +40,7 @@ ACCENT, RISE = 0.3, 0.2
 ACCENT_APART, BEAT_APART = 40, 22
 """Steps from an accent, and from a stressed syllable, to the next one at least."""
 SYLLABLE_DIP = 3.0
-"""Decibels by which a stressed syllable is louder than what is within 0.2 s before or after it."""
+"""Decibels by which a stressed syllable is louder than the sound within 0.2 s before or after it."""
 NEAR = 20
 """Steps on both sides among which an accent is the most prominent: 0.2 s."""
 PHRASE, PAUSE = 50, 25
@@ -110,7 +110,7 @@ class ProsodicEvent:
 class ProsodyTracker:
     """Follows the prosody of one recording, in pieces.
 
-    An accent is where pitch, and to a lesser part loudness, rises above what is usual for the speaker so far; a
+    An accent is where pitch, and to a lesser part loudness, rises above the speaker's usual value so far; a
     stressed syllable is a peak of loudness; a phrase ends where half a second of speech or more is followed by a pause.
 
     Args:
@@ -121,7 +121,7 @@ class ProsodyTracker:
     """
 
     look_ahead = PAUSE + 2
-    """Steps after one that are heard before it is decided on, in addition to those of the gate."""
+    """Steps after one that are heard before it is decided on, in addition to the gate's."""
 
     def __init__(self, gate: VoiceGate | None = None) -> None:
         self.gate = EnergyGate() if gate is None else gate
@@ -156,10 +156,10 @@ class ProsodyTracker:
         """Take more samples (n,) at 16 kHz."""
         new = np.asarray(samples, np.float64)
         self._to_hear = np.concatenate([self._to_hear, new])
-        whole = len(self._to_hear) // HOP
-        if whole:
-            self._active += self._listener.hear(self._to_hear[: whole * HOP].reshape(-1, HOP))
-            self._to_hear = self._to_hear[whole * HOP :]
+        complete = len(self._to_hear) // HOP
+        if complete:
+            self._active += self._listener.hear(self._to_hear[: complete * HOP].reshape(-1, HOP))
+            self._to_hear = self._to_hear[complete * HOP :]
         self._speech = np.concatenate([self._speech, new])
         start = 0
         while len(self._speech) - start >= SPAN + HOP:
@@ -216,14 +216,14 @@ class ProsodyTracker:
             return
         low, high = max(0, at - NEAR), at + NEAR + 1
         around = [_mean(self._prominence, step) for step in range(low, high)]
-        here, before = around[at - low], around[: at - low]
-        if here > max(ACCENT, min(before, default=0.0) + RISE, max(before, default=0.0)) and here >= max(around):
-            self._add("accent", at, min(1.0, here), apart=ACCENT_APART)
+        centre, before = around[at - low], around[: at - low]
+        if centre > max(ACCENT, min(before, default=0.0) + RISE, max(before, default=0.0)) and centre >= max(around):
+            self._add("accent", at, min(1.0, centre), apart=ACCENT_APART)
         levels = [_mean(self._level, step) for step in range(low, high)]
-        now, close = levels[at - low], levels[max(0, at - low - 8) : at - low + 9]
-        dips = now - max(min(levels[: at - low + 1]), min(levels[at - low :])) > SYLLABLE_DIP
-        if now >= max(close) and dips and self._pitch[at] is not None and self._above[at] > -SYLLABLE_DIP:
-            strength = min(1.0, max(0.0, 0.5 + self._above[at] / (2 * DECIBELS) + here / 2))
+        level, close = levels[at - low], levels[max(0, at - low - 8) : at - low + 9]
+        dips = level - max(min(levels[: at - low + 1]), min(levels[at - low :])) > SYLLABLE_DIP
+        if level >= max(close) and dips and self._pitch[at] is not None and self._above[at] > -SYLLABLE_DIP:
+            strength = min(1.0, max(0.0, 0.5 + self._above[at] / (2 * DECIBELS) + centre / 2))
             self._add("stress", at, strength, apart=BEAT_APART)
 
     def _add(self, kind: Literal["accent", "stress", "phrase_end"], at: int, strength: float, apart: int = 0) -> None:

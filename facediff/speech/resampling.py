@@ -1,7 +1,7 @@
 """Another sample rate within two milliseconds.
 
 soxr, by which recordings and streams are resampled elsewhere, works in blocks, and holds back up to 60 ms of a stream:
-a third of what a face may take to answer. Here, a sample needs the 32 samples after it and no more.
+a third of a face's budget for an answer. Here, a sample needs the 32 samples after it and no more.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ class Resampler:
         taps = 2 * self._half
         fitting = len(self._kept) - taps + 1  # places at which a whole filter lies within what is there
         count = max(0, -(-(fitting * self._up - self._next) // self._down))
-        places = self._next + self._down * np.arange(count)
+        positions = self._next + self._down * np.arange(count)
         if count:
-            windows = np.lib.stride_tricks.sliding_window_view(self._kept, taps)[places // self._up]
-            resampled = np.einsum("nt,nt->n", windows, self._filters[places % self._up])
+            windows = np.lib.stride_tricks.sliding_window_view(self._kept, taps)[positions // self._up]
+            resampled = np.einsum("nt,nt->n", windows, self._filters[positions % self._up])
         else:
             resampled = np.zeros(0, np.float32)
         self._next += self._down * count

@@ -33,14 +33,14 @@ def phones_in(path: Path) -> list[Interval]:
 
 def find_tier(tiers: Mapping[str, list[Interval]], kinds: tuple[str, ...]) -> list[Interval] | None:
     """The first tier with intervals that is called so, alone or after a speaker's name; the first kind goes first."""
-    own = {name.rpartition(" - ")[2].strip().lower(): tier for name, tier in reversed([*tiers.items()]) if tier}
-    return next((own[kind] for kind in kinds if kind in own), None)
+    by_name = {name.rpartition(" - ")[2].strip().lower(): tier for name, tier in reversed([*tiers.items()]) if tier}
+    return next((by_name[kind] for kind in kinds if kind in by_name), None)
 
 
 def read_text_grid(path: Path) -> dict[str, list[Interval]]:
     """Interval tiers of a TextGrid by name, in Praat's long or short text format: start and end in seconds, and text.
 
-    Tiers of points are left out. The format is that of Praat's manual, "TextGrid file formats".
+    Tiers of points are left out. The format is from Praat's manual, "TextGrid file formats".
     """
     part = "its header"
     try:
@@ -48,23 +48,23 @@ def read_text_grid(path: Path) -> dict[str, list[Interval]]:
         text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
         # Both formats hold the same texts and numbers in the same order; the long one names each of them.
         tokens = iter(_TOKEN.finditer(text))
-        whole = (_text(tokens), _text(tokens)) == ("ooTextFile", "TextGrid")
+        long_form = (_text(tokens), _text(tokens)) == ("ooTextFile", "TextGrid")
         _number(tokens), _number(tokens), next(tokens)
         tiers: dict[str, list[Interval]] = {}
-        for _ in range(int(_number(tokens)) if whole else 0):
+        for _ in range(int(_number(tokens)) if long_form else 0):
             kind, part = _text(tokens), f"tier {_text(tokens)}"
             _number(tokens), _number(tokens)
             intervals = [_interval(tokens, kind) for _ in range(int(_number(tokens)))]
             if kind != "IntervalTier":
                 continue
             edges = [0.0, *(edge for start, end, _ in intervals for edge in (start, end))]
-            whole = all(later >= edge - 1e-6 for edge, later in zip(edges, edges[1:], strict=False))
-            if not whole:
+            long_form = all(later >= edge - 1e-6 for edge, later in zip(edges, edges[1:], strict=False))
+            if not long_form:
                 break
             tiers.setdefault(part.removeprefix("tier "), intervals)
     except (OSError, StopIteration, ValueError, TypeError, AttributeError):  # a text where a number belongs, or none
-        whole = False
-    if not whole:
+        long_form = False
+    if not long_form:
         raise FaceDiffError(
             f"{path}: {part} cannot be read, is cut short or goes back in time; expected a TextGrid in text format, "
             f"UTF-8 or UTF-16; {REMEDY}"

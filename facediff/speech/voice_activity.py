@@ -1,8 +1,8 @@
-"""When somebody speaks in a recording, and how far a mouth may therefore be open in each frame.
+"""When a recording has speech, and how far a mouth may therefore be open in each frame.
 
 From top to bottom: the detectors, which are registered under the kind ``voice_gate`` and say for every 10 ms whether
 there is speech; :class:`Openness`, which makes of that a smooth number for every motion frame, in whole recordings and
-in streams alike; and what is wrong with a recording (:func:`speech_problems`).
+in streams alike; and faults of recordings (:func:`speech_problems`).
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ HOP = SAMPLE_RATE // 100
 """Samples of a step of 10 ms."""
 
 USUAL_GATE = "energy"
-"""What finds pauses unless somebody says otherwise."""
+"""The default detector of pauses."""
 
 QUICK_GATE = "energy:attack=0.04,lead=0.02,ahead=0"
 """The same where frames must be certain at once: it looks 0.08 s ahead."""
 
 OFF = "off"
-"""In place of a detector's name: the mouth does what the model says, in pauses too."""
+"""In place of a detector's name: the mouth follows the model in pauses too."""
 
 QUIETEST = -65.0
 """Decibels of full scale below which nothing is speech."""
@@ -63,7 +63,7 @@ AS_LOUD = ((60, 3.0), (100, 5.0))
 """Steps, and decibels within which noise stays for so long that is as loud as the speech.
 
 Words in one breath stay within 7 dB for 60 steps in one clip of fifty, and so in one of four hundred (built-in corpus,
-four synthesisers). White and pink noise stay within 3 dB, noise whose spectrum falls with 1/f² within 5.
+four synthesisers). White and pink noise stay within 3 dB, noise with a spectrum of 1/f² within 5.
 """
 
 LONG = AS_LOUD[-1][0]
@@ -82,7 +82,7 @@ NEARLY = 9.0
 """Decibels below the loudest that are nearly as loud."""
 
 BACKGROUND = 34.0
-"""Decibels below the loudest: what is never softer for :data:`MEMORY` steps has something besides speech in it."""
+"""Decibels below the loudest: a recording never softer for :data:`MEMORY` steps has something besides speech in it."""
 
 HYSTERESIS = 3.0
 """Decibels by which speech must fall below the limit that it has risen above."""
@@ -91,7 +91,7 @@ Seconds = Annotated[float, Range(0, 2)]
 
 
 class VoiceGate(ABC):
-    """Says when somebody speaks, and how quickly a mouth comes to rest and leaves it.
+    """Tells when there is speech, and how quickly a mouth comes to rest and leaves it.
 
     Args:
         attack: seconds in which the gate opens.
@@ -112,9 +112,9 @@ class VoiceGate(ABC):
                 f"voice gate: attack and lead are {attack:g} and {lead:g} s; expected at most 0.5 s together"
             )
 
-    def __init_subclass__(cls, **words: Any) -> None:  # noqa: ANN401
+    def __init_subclass__(cls, **keywords: Any) -> None:  # noqa: ANN401
         """Let every constructor refuse options that are out of range."""
-        super().__init_subclass__(**words)
+        super().__init_subclass__(**keywords)
         if "__init__" in vars(cls):
             cls.__init__ = checks_arguments(cls.__init__, "voice gate")  # type: ignore[method-assign]
 
@@ -155,10 +155,10 @@ def read_gate(text: str) -> VoiceGate | None:
 
 @voice_gate.register("energy")
 class EnergyGate(VoiceGate):
-    """Speech is what rises above the noise, whose level is followed.
+    """Speech rises above the noise; the noise's level is followed.
 
-    The level between 150 Hz and 5 kHz is compared with that of the noise: the softest stretch of the last 5 s, and of
-    what is heard ahead, in which it was steady. Where nothing was steady yet, only what is far below the loudest is a
+    The level between 150 Hz and 5 kHz is compared with the noise's: the softest stretch of the last 5 s, and of
+    the speech ahead, in which it was steady. Where nothing was steady yet, only sound far below the loudest is a
     pause.
 
     Args:
@@ -198,7 +198,7 @@ SPEECH_BAND = (
 
 
 class _EnergyListener(Listener):
-    """Follows level, noise and loudest speech; what it decides for a step depends on steps up to look-ahead only."""
+    """Follows level, noise and loudest speech; its decision for a step depends on steps up to look-ahead only."""
 
     def __init__(self, gate: EnergyGate) -> None:
         self.gate = gate
@@ -247,7 +247,7 @@ class _EnergyListener(Listener):
             (SHORT, FLAT, self._short),
             *((length, flat, self._long) for length, flat in AS_LOUD),
         ):
-            some = [max(each, QUIETEST - 20) for each in latest[-length:]]
+            some = [max(step_level, QUIETEST - 20) for step_level in latest[-length:]]
             if len(some) == length and max(some) - min(some) < flat:
                 steady = sum(some) / length
                 _add_softer(stretches, self._step, steady)
@@ -268,7 +268,7 @@ class _EnergyListener(Listener):
 
     def _behind_speech(self) -> bool:
         """Whether something sounds all the time, and nothing around the step is nearly as loud as the speech was."""
-        # Without what comes next, the first sounds of a word are as soft as music. Where nothing else sounds, speech
+        # Without these steps the first sounds of a word are as soft as music. Where nothing else sounds, speech
         # itself is silent for a moment at every p, t and k.
         if self.gate.look_ahead < NEAR or self._softest[0][1] < self._loudest - BACKGROUND:
             return False
@@ -328,10 +328,10 @@ class _WebRtcListener(Listener):
 
     def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
         """Decide on each step."""
-        whole = np.clip(np.round(steps * 32767), -32768, 32767).astype("<i2")
+        samples = np.clip(np.round(steps * 32767), -32768, 32767).astype("<i2")
         # Its detector takes the faintest noise for speech where nothing else was heard before.
         return [
-            bool(np.abs(step).max() > 10) and self._detector.is_speech(step.tobytes(), SAMPLE_RATE) for step in whole
+            bool(np.abs(step).max() > 10) and self._detector.is_speech(step.tobytes(), SAMPLE_RATE) for step in samples
         ]
 
     def finish(self) -> list[bool]:
@@ -374,79 +374,51 @@ class Openness:
     def feed(self, samples: Wave) -> npt.NDArray[np.float32]:
         """Hear more (n,) at 16 kHz; the openness (m,) of the frames that are certain now."""
         speech = np.concatenate([self._rest, np.asarray(samples, np.float64)])
-        whole = len(speech) // HOP
-        self._rest = speech[whole * HOP :]
-        self._active += self._listener.hear(speech[: whole * HOP].reshape(-1, HOP))
+        complete = len(speech) // HOP
+        self._rest = speech[complete * HOP :]
+        self._active += self._listener.hear(speech[: complete * HOP].reshape(-1, HOP))
         last = self._first + len(self._active) - self._ahead - 1
         return self._up_to(max(self._frames, math.floor(last / 100 * self.frame_rate)))
 
     def finish(self, frames: int) -> npt.NDArray[np.float32]:
-        """The openness (m,) of the frames that are left.
-
-        Args:
-            frames: in all.
-        """
+        """The openness (m,) of the frames that are left."""
         self._active += self._listener.finish()
         return self._up_to(max(frames, self._frames))
 
     def _up_to(self, frames: int) -> npt.NDArray[np.float32]:
         """The openness of frames up to a number, and forget what no later frame depends on."""
-        found = np.array([self._of(frame) for frame in range(self._frames, frames)], np.float32)
+        values = np.array([self._of(frame) for frame in range(self._frames, frames)], np.float32)
         self._frames = frames
         needed = math.floor((frames + 0.5) / self.frame_rate * 100) - self._behind - 2
         drop = max(0, needed - self._first)
         self._active, self._first = self._active[drop:], self._first + min(drop, len(self._active))
-        return found
+        return values
 
     def _of(self, frame: int) -> float:
         """The openness of a frame, by the nearest speech before and after it."""
         middle = (frame + 0.5) / self.frame_rate * 100  # in steps
         low = max(0, math.floor(middle) - self._behind - 1 - self._first)
         high = max(0, math.ceil(middle) + self._ahead + 1 - self._first)
-        found = 0.0
-        for place, active in enumerate(self._active[low:high], start=low + self._first):
+        openness = 0.0
+        for step, active in enumerate(self._active[low:high], start=low + self._first):
             if active:
-                away = (place + 0.5 - middle) / 100  # seconds until that step; negative after it
-                free, ramp = (self.gate.lead, self.gate.attack) if away > 0 else (self.gate.hold, self.gate.release)
-                beyond = abs(away) - free
+                away = (step + 0.5 - middle) / 100  # seconds until that step; negative after it
+                margin, ramp = (self.gate.lead, self.gate.attack) if away > 0 else (self.gate.hold, self.gate.release)
+                beyond = abs(away) - margin
                 share = 0.0 if beyond <= 0 else min(1.0, beyond / ramp) if ramp > 0 else 1.0
-                found = max(found, 1 - share * share * (3 - 2 * share))
-        return found
+                openness = max(openness, 1 - share * share * (3 - 2 * share))
+        return openness
 
 
 def openness(speech: Wave, frames: int, frame_rate: float, gate: VoiceGate) -> npt.NDArray[np.float32]:
     """How far a mouth may be open in each frame (frames,) of a whole recording (S,); see :class:`Openness`."""
-    found = Openness(gate, frame_rate)
-    parts = [found.feed(speech), found.finish(frames)]
-    return np.concatenate(parts)[:frames]
+    tracker = Openness(gate, frame_rate)
+    # By the second, since what a gate computes is several times as large as the speech.
+    parts = [tracker.feed(speech[start : start + SAMPLE_RATE]) for start in range(0, len(speech), SAMPLE_RATE)]
+    return np.concatenate([*parts, tracker.finish(frames)])[:frames]
 
 
-def toward_rest(
-    vertices: npt.NDArray[np.float32],
-    openness: npt.NDArray[np.float32],
-    template: npt.NDArray[np.float32],
-    weights: npt.NDArray[np.float32],
-) -> npt.NDArray[np.float32]:
-    """Vertices with the mouth as far at rest as the openness of their frames says.
-
-    Where it is 1 throughout, the vertices are returned as they are.
-
-    Args:
-        vertices: (T, V, 3).
-        openness: (T,), as :func:`openness` gives it.
-        template: (V, 3) the face at rest.
-        weights: (V,) how far each vertex goes to rest.
-    """
-    pausing = np.flatnonzero(openness < 1)
-    if not len(pausing):
-        return vertices
-    made = np.array(vertices, np.float32)
-    for frame in pausing:  # one at a time: all of them may be much memory
-        made[frame] -= (1 - openness[frame]) * weights[:, None] * (vertices[frame] - template)
-    return made
-
-
-# What is wrong with a recording.
+# Faults of recordings.
 
 CLIPPED = 1e-3
 """Share of samples in runs at the largest value above which a recording counts as clipped."""
@@ -459,37 +431,51 @@ TONAL = 0.1
 
 
 def speech_problems(speech: Wave) -> list[str]:
-    """What is wrong with a recording (S,) at 16 kHz, each in a few words; empty where nothing is.
+    """Faults of a recording (S,) at 16 kHz, each in a few words; empty if it has none.
 
     Example:
         >>> import numpy as np
         >>> speech_problems(np.zeros(16000))
         ['is silent']
     """
-    peak = float(np.abs(speech).max(initial=0))
+    peak = float(max(speech.max(initial=0), -speech.min(initial=0)))
     if peak < 1e-4:
         return ["is silent"]
-    found = []
-    top = np.abs(speech) >= 0.998 * peak
-    runs = top[2:] & top[1:-1] & top[:-2]
-    if len(runs) and float(runs.mean()) > CLIPPED:
-        found.append("is clipped: its loudest samples are cut off; record it at a lower level")
+    problems = []
+    if _clipped(speech, 0.998 * peak) > CLIPPED:
+        problems.append("is clipped: its loudest samples are cut off; record it at a lower level")
     size = SAMPLE_RATE // 20
-    parts = np.asarray(speech[: len(speech) // size * size], np.float64).reshape(-1, size)
+    parts = speech[: len(speech) // size * size].reshape(-1, size)
     if len(parts) < 10:
-        return found
-    levels = 10 * np.log10(np.square(parts - parts.mean(1, keepdims=True)).mean(1) + 1e-12)
+        return problems
+    powers = [
+        np.square(some - some.mean(1, keepdims=True)).mean(1)
+        for some in (np.asarray(parts[first : first + 1000], np.float64) for first in range(0, len(parts), 1000))
+    ]
+    levels = 10 * np.log10(np.concatenate(powers) + 1e-12)
     soft = np.argsort(levels)[: max(4, len(parts) // 20)]
     apart = float(np.percentile(levels, 80) - levels[soft].mean())
     if apart < NOISY:
-        power = np.square(np.abs(np.fft.rfft(parts[soft] * np.hanning(size), axis=1)))[:, 4:-8].mean(0) + 1e-12
+        power = (
+            np.square(np.abs(np.fft.rfft(parts[soft].astype(np.float64) * np.hanning(size), axis=1)))[:, 4:-8].mean(0)
+            + 1e-12
+        )
         flatness = float(np.exp(np.log(power).mean()) / power.mean())
         what = "hiss or other noise" if flatness > TONAL else "music, hum or another steady sound"
         if apart < 6:
-            found.append(f"holds {what} from beginning to end and perhaps no speech")
+            problems.append(f"holds {what} from beginning to end and perhaps no speech")
         else:
-            found.append(f"has {what} {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
-    return found
+            problems.append(f"has {what} {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
+    return problems
+
+
+def _clipped(speech: Wave, level: float) -> float:
+    """The share of samples at which three in a row reach a level; by the minute, since speech may last hours."""
+    runs, piece = 0, 60 * SAMPLE_RATE
+    for first in range(0, len(speech), piece):
+        top = np.abs(speech[first : first + piece + 2]) >= level
+        runs += int((top[2:] & top[1:-1] & top[:-2]).sum())
+    return runs / max(1, len(speech) - 2)
 
 
 class MouthAtRest:
@@ -519,5 +505,11 @@ class MouthAtRest:
         return openness(speech, frames, self.frame_rate, self.gate)
 
     def apply(self, vertices: npt.NDArray[np.float32], openness: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Vertices (T, V, 3) with the mouth as far at rest as the openness (T,) says."""
-        return toward_rest(vertices, openness, self.template, self.weights)
+        """Vertices (T, V, 3) with the mouth as far at rest as the openness (T,) says; themselves where all is open."""
+        pausing = np.flatnonzero(openness < 1)
+        if not len(pausing):
+            return vertices
+        result = np.array(vertices, np.float32)
+        for frame in pausing:  # one at a time: all of them may be much memory
+            result[frame] -= (1 - openness[frame]) * self.weights[:, None] * (vertices[frame] - self.template)
+        return result

@@ -114,7 +114,7 @@ class WindowPlan:
     windows may be as short as a frame or two: :data:`LOW_LATENCY`.
 
     Attributes:
-        seconds: length of what a window animates.
+        seconds: length of a window's motion.
         overlap: how much of it the next one shares; at most half of it. With a ``past``: 0, or less than
             all of it.
         before: speech before the window that the model receives too.
@@ -192,10 +192,10 @@ LOW_LATENCY = WindowPlan(seconds=1 / 30, overlap=0.0, before=0.4, after=0.08, ab
 """Windows of one frame that hear 0.08 s ahead and continue the last second of motion; see docs/streaming.md."""
 
 LOW_LATENCY_AHEAD = replace(LOW_LATENCY, past=0.48, ahead=0.48)
-"""The same for a model that draws noise for each frame, whose motion depends on the noise before and after a frame."""
+"""The same for a model that draws noise for each frame; its motion depends on the noise before and after a frame."""
 
 LOW_LATENCY_STEPS = 2
-"""Denoising steps of such a window: what is random in its motion is mostly decided by the motion that it continues."""
+"""Denoising steps of such a window: the motion that it continues mostly decides its random part."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ class FramePlan:
 
     @property
     def hop(self) -> int:
-        """Frames from the start of a window to that of the next, and how many are given out at a time."""
+        """Frames from the start of a window to the next one's, and how many are given out at a time."""
         return self.frames - self.overlap
 
     def window(self, index: int) -> MotionWindow:
@@ -264,7 +264,7 @@ class MotionWindow:
 
     @property
     def context(self) -> int:
-        """Frames before the window whose speech the model receives, but which it does not animate."""
+        """Frames before the window: the model receives their speech, but does not animate them."""
         return min(self.plan.before, self.start)
 
     @property
@@ -312,7 +312,7 @@ def in_parts(
     frames: int | None = None,
     progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
 ) -> Iterator[M_co]:
-    """All motion of a stream for a recording, part by part; the arguments are those of :meth:`SpeechWindows.parts`."""
+    """All motion of a stream for a recording, part by part; arguments as of :meth:`SpeechWindows.parts`."""
     # Fed by the second, as from a microphone, so that memory does not grow with the recording.
     last = max(0, math.ceil(len(speech) / SAMPLE_RATE) - 1)
     seconds = range(last + 1)
@@ -333,7 +333,7 @@ class SpeechWindows(ABC, Generic[M]):
 
     A frame is certain once its window, but for the frames that this window shares with the next, and the speech after
     that window have been heard: :attr:`WindowPlan.look_ahead` seconds later at most. The result depends on the speech
-    and the plan only, not on how the speech was cut into pieces, and not on what comes after the look-ahead: it is the
+    and the plan only, not on how the speech was cut into pieces, and not on speech after the look-ahead: it is the
     same for a file and for a microphone.
 
     Each window's speech is standardised by mean and deviation of all speech heard up to the end of that window.
@@ -359,15 +359,7 @@ class SpeechWindows(ABC, Generic[M]):
 
     @abstractmethod
     def generate(self, window: MotionWindow, speech: Speech, frames: int, mean: float, deviation: float) -> M:
-        """Motion of a window but for its past, which continues the window before it.
-
-        Args:
-            window: which one.
-            speech: that of the window, with some before and after it.
-            frames: how many this speech lasts.
-            mean: of all speech so far.
-            deviation: standard deviation of all speech so far.
-        """
+        """Motion of a window but for its past, which continues the window before it."""
 
     @abstractmethod
     def joined(self, parts: Sequence[M]) -> M:
@@ -385,23 +377,15 @@ class SpeechWindows(ABC, Generic[M]):
         return self._counted(parts)
 
     def finish(self, frames: int | None = None) -> M:
-        """Give the motion that is left.
-
-        Args:
-            frames: how many frames the speech lasts in all; as many as fit its length if None.
-        """
+        """Give the motion that is left."""
         self._refuse_finished()
         self._finished = True
-        total = round(self._heard * self.frame_rate / SAMPLE_RATE) if frames is None else frames
-        if total < 1:
-            raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s)")
-        if total < self.frames:
-            raise FaceDiffError(f"frames: {total} are fewer than the {self.frames} that have been given out already")
+        total = self._total(round(self._heard * self.frame_rate / SAMPLE_RATE), frames)
         self._speech = np.pad(self._speech, (0, max(0, self._sample(total) - self._heard)))
         parts = []
         while self._window.end < total:
             parts.append(self._next_window(min(total, self._window.end + self.plan.after)))
-        # The rest lies within the last window. If it is no longer than what the window before has animated already, its
+        # The rest lies within the last window. If it is no longer than the window before's motion, its
         # frames are certain now, since no later window will blend into them.
         left = total - self._window.start - self._window.fixed
         if self._held is not None and left <= self.plan.overlap:
@@ -417,13 +401,7 @@ class SpeechWindows(ABC, Generic[M]):
         frames: int | None = None,
         progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
     ) -> Iterator[M]:
-        """All motion for a recording, part by part.
-
-        Args:
-            speech: at 16 kHz.
-            frames: how many frames it lasts; as many as fit its length if None.
-            progress: wraps the iteration over its seconds.
-        """
+        """All motion for a recording, part by part."""
         return in_parts(self, speech, frames=frames, progress=progress)
 
     @property
@@ -433,9 +411,9 @@ class SpeechWindows(ABC, Generic[M]):
     def _sample(self, frame: int) -> int:
         return samples_for(frame, self.frame_rate)
 
-    def _next_window(self, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
-        """The window's frames before its overlap with the next, given speech up to frame ``heard``; then advance."""
-        motion = self._generate(self._window, heard)
+    def _next_window(self, samples: int) -> Any:  # noqa: ANN401 - an array or a tensor
+        """The window's frames before its overlap with the next, given speech up to frame ``samples``; then advance."""
+        motion = self._generate(self._window, samples)
         self._window = self.plan.window(self._window.index + 1)
         # Speech before the next window's context will not be heard again, unless the level has not counted it yet.
         needed = self._sample(self._window.start - self._window.context)
@@ -444,27 +422,37 @@ class SpeechWindows(ABC, Generic[M]):
         self._dropped += drop
         return motion[:, : self.plan.hop]
 
-    def _generate(self, window: MotionWindow, heard: int) -> Any:  # noqa: ANN401 - an array or a tensor
-        """Motion of a window, with speech up to frame ``heard``."""
+    def _generate(self, window: MotionWindow, samples: int) -> Any:  # noqa: ANN401 - an array or a tensor
+        """Motion of a window, with speech up to frame ``samples``."""
         # Places in the whole recording; the kept speech starts at sample ``_dropped`` of it. Windows overlap, so the
-        # level counts only what it has not counted yet.
+        # level counts only new samples.
         start = window.start - window.context
-        first, last = self._sample(start), self._sample(heard)
-        self._level.hear(self._speech[max(0, self._level.count - self._dropped) : last - self._dropped])
+        first, last = self._sample(start), self._sample(samples)
+        self._level.add(self._speech[max(0, self._level.count - self._dropped) : last - self._dropped])
         speech = self._speech[first - self._dropped : last - self._dropped]
         # A window that is mostly a pause, standardised by itself, would turn its noise into loud speech.
         deviation = max(self._level.deviation, QUIETEST)
-        if (seen := window.end + self.plan.ahead) > heard:
+        if (end := window.end + self.plan.ahead) > samples:
             # At the mean, which is silence once it is standardised.
-            missing = self._sample(seen) - last
-            speech, heard = np.pad(speech, (0, missing), constant_values=self._level.mean), seen
-        motion: Any = self.generate(window, speech, heard - start, self._level.mean, deviation)
+            padding = self._sample(end) - last
+            speech, samples = np.pad(speech, (0, padding), constant_values=self._level.mean), end
+        motion: Any = self.generate(window, speech, samples - start, self._level.mean, deviation)
         self._held = motion[:, motion.shape[1] - self.plan.overlap :]
         return motion
 
     def _counted(self, parts: Sequence[Any]) -> M:
         self.frames += sum(part.shape[1] for part in parts)
         return self.joined(parts)
+
+    def _total(self, of_speech: int, frames: int | None) -> int:
+        """The number of frames in all: of the speech, or as asked for."""
+        total = of_speech if frames is None else frames
+        if of_speech < 1 or total < max(1, self.frames):
+            raise FaceDiffError(
+                f"frames: {total} of speech that lasts {of_speech}; a frame takes {1 / self.frame_rate:.3f} s, and "
+                f"{self.frames} were given out already"
+            )
+        return total
 
     def _refuse_finished(self) -> None:
         if self._finished:
@@ -479,7 +467,7 @@ class SpeechLevel:
         self._sum = 0.0
         self._squares = 0.0
 
-    def hear(self, samples: Speech) -> None:
+    def add(self, samples: Speech) -> None:
         """Count more samples in."""
         wide = np.asarray(samples, np.float64)
         self.count += len(wide)

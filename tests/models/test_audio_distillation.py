@@ -128,16 +128,16 @@ class Talks(Tiny):
 
 def test_further_speech_is_heard_as_often_as_clips(make_model: Callable[..., AnimationModel], tiny_root: Path) -> None:
     data = Talks(root=str(tiny_root))
-    distil_audio_encoder(make_model(), data, replace(FEW, steps=12, further=500))
+    distil_audio_encoder(make_model(), data, replace(FEW, steps=12, extra_speech=500))
     assert 0 <= min(data.asked) < max(data.asked) < 500
     assert 6 <= len(data.asked) <= 18  # of 24, without what is asked for a second time
     data.asked.clear()
-    distil_audio_encoder(make_model(), data, replace(FEW, further=0))
+    distil_audio_encoder(make_model(), data, replace(FEW, extra_speech=0))
     assert not data.asked
 
 
 def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> None:
-    options = replace(FEW, further=0, pauses=1.0, share=1.0, steps=20)
+    options = replace(FEW, extra_speech=0, pauses=1.0, share=1.0, steps=20)
     augmenter = Augmenter(read_augmentations(["music:share=1,least=6,most=6"]))
     pairs = SpeechPairs(tiny, augmenter, options, LOW_LATENCY_AHEAD)
     pauses = 0
@@ -155,7 +155,7 @@ def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> N
 @pytest.mark.parametrize(("whole", "windows"), [(0.0, LOW_LATENCY_AHEAD), (0.0, LOW_LATENCY), (1.0, LOW_LATENCY_AHEAD)])
 def test_a_student_hears_what_a_window_hears(tiny: Tiny, whole: float, windows: WindowPlan) -> None:
     """Speech up to a moment after the frame and then silence, in place of which it is to expect what comes."""
-    options = replace(FEW, further=0, pauses=0.0, share=0.0, steps=20, low_latency=True, whole=whole)
+    options = replace(FEW, extra_speech=0, pauses=0.0, share=0.0, steps=20, low_latency=True, complete_share=whole)
     pairs = SpeechPairs(tiny, Augmenter([]), options, windows)
     after, ahead = round(windows.after * 50), round(windows.ahead * 50)
     for number in range(len(pairs)):
@@ -163,7 +163,8 @@ def test_a_student_hears_what_a_window_hears(tiny: Tiny, whole: float, windows: 
         assert batch.mean is not None
         assert batch.deviation is not None
         rows = zip(
-            *(each.tolist() for each in (batch.places[:, 0], batch.steps, batch.compared, batch.lengths)), strict=True
+            *(each.tolist() for each in (batch.teacher_steps[:, 0], batch.steps, batch.compared, batch.lengths)),
+            strict=True,
         )
         for row, (start, steps, (first, last), length) in enumerate(rows):
             heard = steps if whole else steps - max(0, ahead - after)

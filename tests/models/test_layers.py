@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from facediff.models.layers import (
-    Attention,
     RotaryEmbedding,
     interpolate_frames,
     recurrent_nodes,
@@ -19,44 +18,12 @@ from tests.fakes.onnx_nodes import recurrent_node
 Array = NDArray[np.float64]
 
 
-def linear(layer: nn.Linear, x: Array) -> Array:
-    return x @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
-
-
-def softmax(x: Array) -> Array:
-    weights = np.exp(x - x.max(-1, keepdims=True))
-    return weights / weights.sum(-1, keepdims=True)
-
-
 def rotated(x: Array, base: float = 10_000.0) -> Array:
     """RoFormer's rotation as multiplication of complex pairs, frame by frame."""
     half = x.shape[-1] // 2
     frequency = base ** (-np.arange(half) / half)
     turned = (x[..., :half] + 1j * x[..., half:]) * np.exp(1j * np.arange(len(x))[:, None] * frequency)
     return np.concatenate([turned.real, turned.imag], axis=-1)
-
-
-@pytest.mark.parametrize("rotary", [False, True])
-def test_attention_against_numpy(rotary: bool) -> None:
-    torch.manual_seed(0)
-    dim, context_dim, heads, frames, keys = 12, 7, 3, 5, 6
-    attention = Attention(dim, context_dim, heads, rotary=rotary).double()
-    x, context = torch.randn(2, frames, dim).double(), torch.randn(2, keys, context_dim).double()
-    mask = torch.tensor([[True] * keys, [True, False, True, True, False, False]])
-    result = attention(x, context, mask).detach().numpy()
-    both = linear(attention.key_value, context.numpy())
-    query, key, value = linear(attention.query, x.numpy()), both[..., :dim], both[..., dim:]
-    size = dim // heads
-    for clip in range(2):
-        mixed = np.zeros((frames, dim))
-        for head in range(heads):
-            part = slice(head * size, (head + 1) * size)
-            q, k = query[clip][:, part], key[clip][:, part]
-            if rotary:
-                q, k = rotated(q), rotated(k)
-            scores = np.where(mask[clip].numpy(), q @ k.T / np.sqrt(size), -np.inf)
-            mixed[:, part] = softmax(scores) @ value[clip][:, part]
-        np.testing.assert_allclose(result[clip], linear(attention.out, mixed), atol=1e-6)
 
 
 def test_rotary_scores_depend_on_distance_only() -> None:
@@ -68,15 +35,6 @@ def test_rotary_scores_depend_on_distance_only() -> None:
     assert scores[0].std() > 0.1  # and they do depend on it
     torch.testing.assert_close(rotary(query).norm(dim=-1), query.norm(dim=-1))
     np.testing.assert_allclose(rotary(query)[0, 0].numpy(), rotated(query[0, 0].numpy()), atol=1e-5)
-
-
-def test_rotary_attention_notices_order_and_plain_attention_does_not() -> None:
-    torch.manual_seed(0)
-    x, context = torch.randn(1, 4, 16), torch.randn(1, 6, 16)
-    for rotary in (False, True):
-        attention = Attention(16, 16, 2, rotary=rotary)
-        same = torch.allclose(attention(x, context), attention(x, context.flip(1)), atol=1e-5)
-        assert same != rotary
 
 
 def interpolated(values: Tensor, frames: int) -> Array:

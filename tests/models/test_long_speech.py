@@ -202,7 +202,7 @@ def test_samples_are_what_their_seeds_give_and_the_speech_is_encoded_once(ready:
 def test_level_is_that_of_all_that_was_heard() -> None:
     level, whole = SpeechLevel(), speech(2).double() + 0.1
     for piece in pieces(whole, 5):
-        level.hear(piece)
+        level.add(piece)
     assert level.count == len(whole)
     np.testing.assert_allclose(level.mean, whole.numpy().mean(), rtol=1e-9)
     np.testing.assert_allclose(level.deviation, whole.numpy().std(), rtol=1e-9)

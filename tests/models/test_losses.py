@@ -101,18 +101,6 @@ def test_loss_gradient_is_that_of_the_formula_and_zero_on_padding(name: str) -> 
     assert float(prediction.grad[(0, *place)]) == pytest.approx(slope, rel=1e-5)
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_loss_of_short_clips_has_no_acceleration_or_velocity(frames: int) -> None:
-    (truth, mask), (prediction, _) = pad(clips((frames,), 6)), pad(clips((frames,), 7))
-    prediction.requires_grad_()
-    acceleration = losses.acceleration_loss(prediction, truth, mask)
-    velocity = losses.velocity_loss(prediction, truth, mask)
-    assert acceleration.item() == 0.0
-    assert (velocity.item() == 0.0) == (frames == 1)
-    (acceleration + velocity + losses.reconstruction_loss(prediction, truth, mask)).backward()
-    assert torch.isfinite(prediction.grad).all()
-
-
 @pytest.mark.parametrize("name", REFERENCES)
 @pytest.mark.parametrize("value", [0.0, 0.3])
 def test_loss_gradient_is_finite_without_any_motion(name: str, value: float) -> None:
@@ -120,16 +108,6 @@ def test_loss_gradient_is_finite_without_any_motion(name: str, value: float) -> 
     mask = torch.ones(2, 5, dtype=torch.bool)
     loss(name, prediction, torch.zeros_like(prediction), mask).backward()
     assert torch.isfinite(prediction.grad).all()
-
-
-def test_face_loss_sees_its_region_only() -> None:
-    (truth, mask), (prediction, _) = pad(clips((8,), 8)), pad(clips((8,), 9))
-    before = loss("face", prediction, truth, mask)
-    outside = [v for v in range(VERTICES) if v not in REGION]
-    prediction[:, :, outside] += torch.randn(1, 8, len(outside), 3, dtype=torch.float64)
-    assert torch.equal(loss("face", prediction, truth, mask), before)
-    prediction[:, 0, REGION[0]] += 1
-    assert not torch.equal(loss("face", prediction, truth, mask), before)
 
 
 WEIGHTS = {"reconstruction": 1.0, "velocity": 0.3, "acceleration": 0.7, "face": 0.5}
@@ -176,22 +154,6 @@ def test_fused_losses_are_their_definitions(
     torch.testing.assert_close(found[0], expected[0], rtol=1e-12, atol=1e-14)
     torch.testing.assert_close(found[1], expected[1], rtol=1e-11, atol=1e-13)
     assert not found[1][0][~mask].any()
-
-
-@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0, 2.0])
-def test_fused_losses_pass_on_what_comes_after_them(factor: float) -> None:
-    """Gradients are ready with the loss, and are multiplied by whatever its own gradient turns out to be."""
-    *parts, truth, mask = linear_parts((6, 4), 1)
-    found = []
-    for compute in (losses_fused.fused_losses, None):
-        leaves = [part.clone().requires_grad_() for part in parts]
-        if compute is None:
-            terms = by_definition(*leaves, truth, mask, torch.tensor(REGION), 1.0)
-        else:
-            terms = compute(*leaves, truth, mask, torch.tensor(REGION), WEIGHTS)
-        (factor * terms["loss"]).backward()
-        found.append([leaf.grad for leaf in leaves])
-    torch.testing.assert_close(found[0], found[1], rtol=1e-11, atol=1e-13)
 
 
 @pytest.mark.parametrize("wanted", [0, 1, 2])

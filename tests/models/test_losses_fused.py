@@ -79,25 +79,6 @@ def test_a_training_step_noises_each_clip_as_often_as_asked(model: DualPathDiffu
     assert len(set(seen)) > 6  # each draw has a step of its own
 
 
-def test_losses_of_a_batch_are_those_of_its_clips(model: DualPathDiffusion, tiny: Tiny) -> None:
-    dataset = tiny.dataset("train")
-    clips = [dataset[place] for place in (0, 3, 7)]
-    batch = collate(clips)
-    lengths = batch.frame_lengths
-    assert len(set(lengths.tolist())) == 3
-    noise, step = torch.randn(3, batch.motion.shape[1], 72), torch.tensor([3, 20, 39])
-    whole = model.losses_at(batch, step, noise.clone())
-    singles = [
-        model.losses_at(collate([clip]), step[i : i + 1], noise[i : i + 1, : lengths[i]].clone())
-        for i, clip in enumerate(clips)
-    ]
-    for order, name in enumerate(("reconstruction", "velocity", "acceleration")):
-        shares = (lengths - order) / (lengths - order).sum()
-        mean = sum(share * single[name] for share, single in zip(shares, singles, strict=True))
-        torch.testing.assert_close(whole[name], mean, rtol=1e-4, atol=0)
-    torch.testing.assert_close(whole["face"], sum(single["face"] for single in singles) / 3, rtol=1e-4, atol=0)
-
-
 @pytest.mark.slow
 def test_mixed_precision_learns_as_full_precision_does(
     make_model: Make, tiny: Tiny, make_trainer: Callable[..., pl.Trainer]

@@ -104,16 +104,6 @@ def test_mesh_encoder_state_dict_needs_no_mesh(name: str, make: Callable[..., Me
     assert not torch.equal(make(name, seed=1)(motion()), expected)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_mesh_encoder_refuses_motion_of_another_mesh(name: str, make: Callable[..., MeshEncoder]) -> None:
-    encoder = make(name)
-    for vertices in (VERTICES + 1, VERTICES - 1):
-        with pytest.raises(ValueError, match=rf"made for \({VERTICES}, 3\)"):
-            encoder(torch.zeros(1, 2, vertices, 3))
-    with pytest.raises(ValueError, match=rf"made for \({VERTICES}, 3\)"):
-        encoder(torch.zeros(1, 2, VERTICES, 1))
-
-
 def naive(encoder: SpiralMeshEncoder, mesh: MeshHierarchy, frame: np.ndarray) -> np.ndarray:
     """A frame (V, 3) through [spiral convolution at every vertex → selection → leaky ReLU] …, in float64 loops."""
     features = frame.astype(np.float64)
@@ -174,22 +164,3 @@ def test_spiral_without_a_mesh_is_an_error(hierarchy: Hierarchy, pooling: Litera
         mine.copy_(theirs)
     other.load_state_dict(dict(encoder.named_parameters()), strict=False)
     assert torch.equal(other(motion()), encoder(motion()))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"levels": 2}, r"\[168, 42, 11\] vertices at its levels; expected \[168, 42, 11, 3\]"),
-        ({"factor": 3}, r"\[168, 56, 19, 7\]"),
-        ({"pooling": "mean"}, r"spirals of the shape \(168, 12\); expected \(42, 12\)"),
-        ({"spiral_length": 9}, r"spirals of the shape \(42, 9\); expected \(42, 12\)"),
-        ({"vertices": tuple(range(100))}, r"\[100, 25, 7, 2\]"),
-    ],
-)
-def test_attach_refuses_another_mesh_and_changes_nothing(
-    options: dict[str, Any], message: str, hierarchy: Hierarchy
-) -> None:
-    encoder = SpiralMeshEncoder(dim=DIM, n_vertices=VERTICES, dims=3)
-    with pytest.raises(FaceDiffError, match=message):
-        encoder.attach(hierarchy(**{**encoder.mesh_options, **options}))
-    assert not encoder.attached

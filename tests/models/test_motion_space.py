@@ -60,13 +60,6 @@ def test_components_of_the_motions_own_rank_lose_nothing(whitening: float, weigh
     torch.testing.assert_close(space.encode(x).var(1, unbiased=False)[0], space.sizes.square(), rtol=1e-3, atol=0)
 
 
-def test_more_components_than_the_motion_has_change_nothing() -> None:
-    x = motion()
-    space = components(x, count=40)
-    torch.testing.assert_close(space.decode(space.encode(x)), x, rtol=1e-4, atol=1e-4)
-    assert space.sizes.isfinite().all()
-
-
 def test_components_that_the_motion_does_not_have_are_the_smallest_there_are() -> None:
     space = components(motion(), count=9)
     deviations = space.components.deviations
@@ -93,20 +86,6 @@ def test_the_noise_sees_components_in_the_sizes_that_they_are_given(whitening: f
     for step in (0, 500, 999):
         wanted = importance / (importance * scales.out[step].numpy() ** 2).sum()
         np.testing.assert_allclose(scales.loss[step].numpy(), wanted, rtol=1e-3)
-
-
-def test_without_whitening_distances_are_those_of_the_vertices() -> None:
-    x = motion()
-    z = components(x, count=5, whitening=0.0).encode(x)
-    z, x = z.double(), x.double()
-    between = torch.cdist(z[0, :40], z[0, :40])
-    torch.testing.assert_close(between, torch.cdist(x[0, :40].flatten(1), x[0, :40].flatten(1)), rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize(("whitening", "ratio"), [(0.0, 15.0), (0.5, 15.0**0.5), (1.0, 1.0)])
-def test_whitening_brings_the_sizes_of_components_together(whitening: float, ratio: float) -> None:
-    sizes = components(motion(20_000), count=4, whitening=whitening).sizes
-    assert float(sizes[0] / sizes[3]) == pytest.approx(ratio, rel=0.05)
 
 
 @pytest.mark.parametrize("whitening", [0.0, 0.5, 1.0])
@@ -615,17 +594,6 @@ def test_eyelids_count_by_the_pairs_of_the_corpus(
     assert (weights[lids.flatten()] == 9).all()
     assert int((weights == 9).sum()) == 12
     assert (weights[upper[4:]] == 3).all()
-
-
-def test_the_upper_face_can_count_more(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) -> None:
-    model: DualPathDiffusion = make_model(motion_space=partial(SPACE, upper_face_weight=3.0))
-    make_trainer().fit(model, datamodule=tiny)
-    space = model.motion_space
-    assert isinstance(space, ComponentMotion)
-    weights = space.components.weights.view(-1, 3)
-    upper = model.assets.regions["upper_face"]
-    assert (weights[upper] == 3).all()
-    assert int((weights == 3).sum()) == 3 * len(upper)
 
 
 def test_training_on_components_is_training_on_vertices(make_model: Make, make_trainer: Make, tiny: Tiny) -> None:

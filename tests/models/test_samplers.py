@@ -17,21 +17,6 @@ from facediff.models.dual_path.recipe import log_snr_weights
 from facediff.models.samplers import SCHEDULES, DpmSolverSampler, NoiseProcess, Sampler, unit_noise
 
 
-@pytest.mark.parametrize("steps", [10, 1000])
-def test_cosine_schedule_is_the_published_one(steps: int) -> None:
-    """Nichol and Dhariwal 2021, eq. 17, with their s = 0.008 and their cap of 0.999."""
-
-    def curve(t: np.ndarray) -> np.ndarray:
-        return np.cos((t / steps + 0.008) / 1.008 * np.pi / 2) ** 2
-
-    n = np.arange(steps)
-    expected = np.minimum(1 - curve(n + 1) / curve(n), 0.999)
-    process = NoiseProcess(steps)
-    np.testing.assert_allclose(process.variances.numpy(), expected, rtol=1e-5)
-    np.testing.assert_allclose(process.signal.numpy(), np.cumprod(1 - expected), rtol=1e-3)
-    assert process.signal[-1] < 1e-4  # the process ends in pure noise, from which sampling starts
-
-
 @pytest.mark.parametrize("steps", [1, 10, 999, 1000])
 @pytest.mark.parametrize("schedule", SCHEDULES)
 def test_schedules_are_their_formulas_in_float32(schedule: str, steps: int) -> None:
@@ -198,25 +183,6 @@ def test_spread_takes_samples_twice_that_factor_further_from_the_mean() -> None:
 
 
 @pytest.mark.parametrize("steps", [20, 7])
-def test_ddpm_step_is_the_gaussian_posterior(steps: int) -> None:
-    """q(Mⁿ⁻¹ | Mⁿ, M⁰), Ho et al. 2020, eq. 6 and 7, between any two of the steps taken."""
-    process, shape = NoiseProcess(20), (400, 100)
-    truth = torch.randn(shape, generator=torch.Generator().manual_seed(9))
-    seen, motions = trace(make("ddpm", process, steps=steps), lambda *_: truth, torch.randn(shape))
-    kept = process.signal.double().numpy()
-    for i in range(steps - 1):
-        now, then = kept[seen[i]], kept[seen[i + 1]]
-        alpha = 1 - now / then  # noise variance from one to the other
-        mean = np.sqrt(then) * alpha / (1 - now) * truth + np.sqrt(1 - alpha) * (1 - then) / (1 - now) * motions[i]
-        variance = (1 - then) / (1 - now) * alpha
-        residual = (motions[i + 1] - mean).numpy() / np.sqrt(variance)
-        assert residual.mean() == pytest.approx(0, abs=0.02)
-        assert residual.std() == pytest.approx(1, abs=0.02)
-        for other in (truth, motions[i]):  # what is left is fresh noise
-            assert np.corrcoef(residual.ravel(), other.numpy().ravel())[0, 1] == pytest.approx(0, abs=0.02)
-
-
-@pytest.mark.parametrize("steps", [20, 7])
 def test_ddpm_run_is_the_formula_with_the_same_noise(steps: int) -> None:
     """The whole run against Ho et al. 2020, eq. 6 and 7, in NumPy's float64."""
     process = NoiseProcess(20)
@@ -253,16 +219,6 @@ def test_ddim_step_is_the_published_update(steps: int, eta: float) -> None:
         else:
             assert residual.mean() == pytest.approx(0, abs=0.02 * sigma)
             assert residual.std() == pytest.approx(sigma, rel=0.02)
-
-
-def test_dpm_solver_of_first_order_is_ddim() -> None:
-    """Lu et al. 2022, section 4.1: the first-order solver and DDIM are the same update."""
-    start = torch.randn(2, 3, 4)
-    ends = [
-        trace(make(name, NoiseProcess(1000), steps=20, **options), lambda x, _: 0.5 * x.tanh(), start)[1][-1]
-        for name, options in (("ddim", {}), ("dpm_solver", {"order": 1}))
-    ]
-    torch.testing.assert_close(*ends, rtol=1e-3, atol=1e-3)
 
 
 DPM_STEPS = (1, 2, 3, 7, 14, 15, 20)
@@ -325,17 +281,6 @@ def test_linear_sampler_commutes_with_linear_maps(name: str, options: dict[str, 
     torch.testing.assert_close(runs[0] @ image, runs[1], rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", registry.sampler.names())
-@pytest.mark.parametrize("steps", [1, 7, 61, 103, 121, 122, 201, 206, 217, 999, 1000])
-def test_timesteps_are_as_many_as_steps_and_descend(name: str, steps: int) -> None:
-    # 61, 103, 121 … are numbers for which spacing by N // steps has one step too many, the last at -1.
-    places = registry.sampler.get(name)(process=NoiseProcess(1000), steps=steps).timesteps
-    assert len(places) == steps
-    assert places[0] == 999
-    assert places[-1] >= 0
-    assert places == sorted(set(places), reverse=True)
-
-
 def log_snr(process: NoiseProcess, places: Sequence[int]) -> np.ndarray:
     kept = process.signal.double().numpy()[list(places)]
     return np.log(kept / (1 - kept)) / 2
@@ -362,7 +307,7 @@ def test_log_snr_spacing_is_even_in_the_solvers_time(scale: float, steps: int, f
 
 @pytest.mark.parametrize("name", ["ddim", "dpm_solver", "ddpm"])
 @pytest.mark.parametrize("spacing", ["steps", "log_snr"])
-@pytest.mark.parametrize("steps", [1, 2, 60, 600])
+@pytest.mark.parametrize("steps", [1, 2, 61, 103, 600])
 @pytest.mark.parametrize("last_noise", [None, 0.01, 0.3])
 def test_any_spacing_visits_each_step_once(name: str, spacing: str, steps: int, last_noise: float | None) -> None:
     made = registry.sampler.get(name)(process=NoiseProcess(), steps=steps, spacing=spacing, last_noise=last_noise)

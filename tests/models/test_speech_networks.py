@@ -67,11 +67,6 @@ def test_hubert_trains_its_feature_projection_where_asked(hubert_source: Path) -
     assert all(value.grad is None for value in frozen)  # a gradient passes through them and changes nothing
 
 
-def test_hubert_computes_no_gradient_for_the_frozen_convolutions(hubert_source: Path) -> None:
-    encoder = HubertEncoder(dim=8, source=str(hubert_source)).train()
-    assert not encoder.hubert.feature_extractor(torch.randn(1, 4000)).requires_grad
-
-
 def test_hubert_training_is_not_random_by_default(
     hubert_source: Path, without_dropout: Callable[[nn.Module], nn.Module]
 ) -> None:

@@ -117,7 +117,7 @@ def test_an_unseen_speakers_style_needs_their_template(
     suffix: str, unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, tmp_path: Path
 ) -> None:
     path, face, offsets = unseen
-    with pytest.raises(FaceDiffError, match="give that person's neutral face with style_template"):
+    with pytest.raises(FaceDiffError, match="give that person's own with style_template"):
         read_styles(str(path), "A", model)
     template = tmp_path / f"neutral.{suffix}"
     if suffix == "npy":

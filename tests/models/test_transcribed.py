@@ -15,7 +15,7 @@ from facediff.data import Puppet
 from facediff.errors import FaceDiffError
 from facediff.models.audio_distillation import DistillationOptions, distil_audio_encoder, with_pause_in_both
 from facediff.models.base import AnimationModel
-from facediff.models.transcribed import STEP_RATE, Said, read_said
+from facediff.models.transcribed import STEP_RATE, TranscribedRecording, read_transcribed
 from tests.fakes.tiny import Tiny
 
 TEXT = "mabopimeba"
@@ -58,11 +58,11 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_steps_go_with_the_same_letters(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
-    (said,) = read_said(folder, data, make_model().speech_encoder.eval(), most=9, seed=0)
-    letters = np.arange(len(said.places)) / STEP_RATE / 0.14
+    (recording,) = read_transcribed(folder, data, make_model().speech_encoder.eval(), limit=9, seed=0)
+    letters = np.arange(len(recording.teacher_steps)) / STEP_RATE / 0.14
     assert len(letters) == round(0.14 * len(TEXT) * STEP_RATE)
-    assert np.abs(said.places / STEP_RATE / 0.1 - letters).max() < 0.5
-    assert abs(float(np.abs(said.recording).max()) - float(np.abs(said.spoken).max())) < 1e-3
+    assert np.abs(recording.teacher_steps / STEP_RATE / 0.1 - letters).max() < 0.5
+    assert abs(float(np.abs(recording.recording).max()) - float(np.abs(recording.synthesised).max())) < 1e-3
 
 
 def test_the_name_of_a_text_says_its_language(
@@ -72,26 +72,28 @@ def test_the_name_of_a_text_says_its_language(
     words.rename(words.with_name("a.he.txt"))
     words.with_name("b.txt").write_text("of no recording", encoding="utf-8")
     encoder = make_model().speech_encoder.eval()
-    (backwards,) = read_said(folder, data, encoder, most=9, seed=0)
-    assert np.array_equal(backwards.spoken, sung(TEXT[::-1], 0.1).astype(np.float16))
+    (backwards,) = read_transcribed(folder, data, encoder, limit=9, seed=0)
+    assert np.array_equal(backwards.synthesised, sung(TEXT[::-1], 0.1).astype(np.float16))
     words.write_text(TEXT, encoding="utf-8")
-    (forwards,) = read_said(folder, data, encoder, most=9, seed=0)
-    assert np.array_equal(forwards.spoken, sung(TEXT, 0.1).astype(np.float16))
+    (forwards,) = read_transcribed(folder, data, encoder, limit=9, seed=0)
+    assert np.array_equal(forwards.synthesised, sung(TEXT, 0.1).astype(np.float16))
 
 
 def test_two_recordings_share_a_text(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
     soundfile.write(folder / "one" / "a.flac", sung(TEXT, 0.12), 16_000)
-    both = read_said(folder, data, make_model().speech_encoder.eval(), most=9, seed=0)
-    assert sorted(len(said.recording) for said in both) == [round(16_000 * each * len(TEXT)) for each in (0.12, 0.14)]
+    both = read_transcribed(folder, data, make_model().speech_encoder.eval(), limit=9, seed=0)
+    assert sorted(len(recording.recording) for recording in both) == [
+        round(16_000 * each * len(TEXT)) for each in (0.12, 0.14)
+    ]
 
 
 def test_a_window_is_of_both(folder: Path, data: Singers, make_model: Callable[..., AnimationModel]) -> None:
     """Samples that carry their own number say where a window was cut."""
     places = np.arange(200) * 2 // 3
     counted = (np.arange(200 * 320) // 320).astype(np.float16)
-    said = Said(counted, counted[: 150 * 320], places)
+    recording = TranscribedRecording(counted, counted[: 150 * 320], places)
     for seed in range(5):
-        spoken, heard, within = said.window(1.0, np.random.default_rng(seed))
+        spoken, heard, within = recording.window(1.0, np.random.default_rng(seed))
         assert len(heard) == 50 * 320
         steps = heard[::320].astype(int)
         assert np.array_equal(spoken[within * 320].astype(int), places[steps])
@@ -120,20 +122,20 @@ def test_the_student_hears_the_singer_as_the_teacher_hears_the_corpus(
     folder: Path, data: Singers, make_model: Callable[..., AnimationModel]
 ) -> None:
     teacher = make_model().speech_encoder.eval()
-    (said,) = read_said(folder, data, teacher, most=9, seed=0)
-    recording, spoken = (torch.from_numpy(each.astype(np.float32))[None] for each in said[:2])
+    (recording,) = read_transcribed(folder, data, teacher, limit=9, seed=0)
+    speech, synthesised = (torch.from_numpy(wave.astype(np.float32))[None] for wave in recording[:2])
 
     def features(encoder: torch.nn.Module, speech: torch.Tensor) -> torch.Tensor:
         count = torch.tensor([speech.shape[1]])
         with torch.inference_mode():
             return encoder(speech, count, count * STEP_RATE // 16_000)[0]
 
-    target = features(teacher, spoken)[torch.from_numpy(said.places)]
+    target = features(teacher, synthesised)[torch.from_numpy(recording.teacher_steps)]
 
     def error(**options: object) -> float:
         model = make_model()
         distil_audio_encoder(model, data, replace(OPTIONS, **options))  # type: ignore[arg-type]
-        return float((features(model.speech_encoder, recording) - target).square().mean())
+        return float((features(model.speech_encoder, speech) - target).square().mean())
 
     assert error(transcribed=folder, transcribed_share=0.8) < 0.3 * error()
 

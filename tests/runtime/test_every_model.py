@@ -24,25 +24,16 @@ from facediff.runtime import RuntimeModel
 from facediff.speech.windows import LOW_LATENCY, WindowPlan
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
+from tests.models.published.conftest import METHODS
 from tests.runtime.test_runtime import sound
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
 MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
 SIZES: dict[str, Any] = {"n_vertices": VERTICES, "identities": SEEN, "frame_rate": float(RATE), "audio_encoder": MEL}
 
-NETWORK = {
-    **{"model_type": "wav2vec2", "hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2},
-    **{"intermediate_size": 8, "conv_dim": [4] * 7, "num_conv_pos_embeddings": 4, "num_conv_pos_embedding_groups": 2},
-}
-"""A tiny speech network of random weights."""
-
 STYLE_CONTENT = {"dim": 16, "content_dim": 16}
-PUBLISHED = {"audio_dim": 16, "dim": 16}
-SELFTALK = {**PUBLISHED, "lip_reader": "none"}
-VOCA = {**PUBLISHED, "components": 8, "channels": (8, 8)}
-EMOTALK = {**PUBLISHED, "emotion_config": NETWORK, "emotion_dim": 4, "level_dim": 2, "person_dim": 2}
-FACEDIFFUSER = {**PUBLISHED, "diffusion_steps": 8}
-DIFFSPEAKER = {**PUBLISHED, "sampling_steps": 8, "smooth": True}
+SELFTALK = {**METHODS["SelfTalk"], "lip_reader": "none"}
+FACEDIFFUSER, DIFFSPEAKER, VOCA = (METHODS[name] for name in ("FaceDiffuser", "DiffSpeaker", "Voca"))
 OWN = {"audio_dim": None}  # the encoder's own channels
 
 DUAL_PATH = {
@@ -58,16 +49,16 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
         "StyleContentDisentanglement",
         {**STYLE_CONTENT, **IN_CHANNELS, "mesh_encoder": registry.mesh_encoder.linear},
     ),
-    "EmoTalk in channels": ("EmoTalk", {**EMOTALK, **IN_CHANNELS}),
-    "UniTalker in channels": ("UniTalker", {**PUBLISHED, **IN_CHANNELS}),
-    "LAM in channels": ("LamAudio2Expression", {**PUBLISHED, **IN_CHANNELS}),
+    "EmoTalk in channels": ("EmoTalk", {**METHODS["EmoTalk"], **IN_CHANNELS}),
+    "UniTalker in channels": ("UniTalker", {**METHODS["UniTalker"], **IN_CHANNELS}),
+    "LAM in channels": ("LamAudio2Expression", {**METHODS["LamAudio2Expression"], **IN_CHANNELS}),
     "style content": ("StyleContentDisentanglement", STYLE_CONTENT),
     "style content at 50": ("StyleContentDisentanglement", {**STYLE_CONTENT, "speech_rate": 50}),
     "style content at 12.5": ("StyleContentDisentanglement", {**STYLE_CONTENT, "speech_rate": 12.5}),
     "SelfTalk": ("SelfTalk", SELFTALK),
     "SelfTalk at 25, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2"}),
     "SelfTalk at 30, wav2vec": ("SelfTalk", {**SELFTALK, **OWN, "audio_encoder": "wav2vec2", "frame_rate": 30.0}),
-    "EmoTalk": ("EmoTalk", EMOTALK),
+    "EmoTalk": ("EmoTalk", METHODS["EmoTalk"]),
     "FaceDiffuser": ("FaceDiffuser", FACEDIFFUSER),
     "FaceDiffuser, folded, HuBERT": (
         "FaceDiffuser",

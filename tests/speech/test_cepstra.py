@@ -12,22 +12,6 @@ from facediff.speech.cepstra import align_features, cepstra, mel_filters
 RATE = 16_000
 
 
-def test_mel_filters_are_triangles_on_the_mel_scale() -> None:
-    filters = mel_filters(40, 4096, 60.0, 7600.0)
-    hertz = np.arange(2049) * RATE / 4096
-    assert filters.shape == (40, 2049)
-    assert (filters >= 0).all()
-    peaks = hertz[filters.argmax(1)]
-    assert (np.diff(peaks) > 0).all()
-    assert not filters[:, (hertz < 60) | (hertz > 7600)].any()
-    mels = np.diff(2595 * np.log10(1 + peaks / 700))
-    np.testing.assert_allclose(mels, mels.mean(), rtol=0.15)
-    # Unit area: a flat spectrum gives a flat result.
-    np.testing.assert_allclose(filters.sum(1) * RATE / 4096, 1, rtol=0.02)
-    rising = [np.diff(row[: row.argmax() + 1]).min() >= 0 >= np.diff(row[row.argmax() :]).max() for row in filters]
-    assert all(rising)
-
-
 @pytest.mark.parametrize(("bands", "size", "low", "high"), [(64, 512, 60.0, 7600.0), (7, 256, 0.0, 4000.0)])
 def test_mel_filters_are_their_formula(bands: int, size: int, low: float, high: float) -> None:
     """Triangles between neighbours of evenly spaced mels 2595 log₁₀(1 + f/700), of unit area."""
@@ -69,11 +53,6 @@ def test_a_warped_copy_is_aligned() -> None:
     np.testing.assert_array_equal(pace[found], np.arange(60))
 
 
-def test_equal_readings_are_aligned_one_to_one() -> None:
-    features = np.random.default_rng(1).normal(size=(40, 5))
-    np.testing.assert_array_equal(align_features(features, features), np.arange(40))
-
-
 @pytest.mark.parametrize(
     ("frames", "others", "later", "earlier"), [(40, 40, 10, 10), (40, 60, 55, 36), (60, 40, 35, 55)]
 )
@@ -104,8 +83,3 @@ def test_slowed_speech_is_aligned() -> None:
     found = align_features(fast, slow)
     error = np.abs(found - (np.arange(50) + 0.5) * 1.5)
     assert error.mean() < 1.5, "frames of the slow reading"
-
-
-def test_features_say_little_of_loudness() -> None:
-    audio = np.random.default_rng(0).normal(size=RATE)
-    np.testing.assert_allclose(cepstra(audio, 25, 25.0), cepstra(audio * 3, 25, 25.0), atol=1e-3)

@@ -25,7 +25,7 @@ from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
-from facediff.models.layers import Heads, Layers, Width
+from facediff.models.layers import Heads, Layers, Width, check_heads
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
 from facediff.models.published.clip_style import read_table
 from facediff.models.published.parametric import ParametricModel, PieceStream, window_at
@@ -44,7 +44,7 @@ FLIPPED_BITS = 0.3
 """Share of the given bits that are turned over in training."""
 
 DROPPED = 0.1
-"""Share of clips whose style, speech or chunk before is taken away in training, each by itself."""
+"""Share of clips without style, speech or the chunk before in training, each by itself."""
 
 WEIGHTS = {"velocity": 5.0, "head": 1.0, "commitment": 0.2}
 """Of the codec's errors of first differences and, once more, of the head, and of the distance of codes from bits."""
@@ -55,7 +55,7 @@ LARGEST_SCALE = math.log(100)
 
 @dataclass(frozen=True)
 class ChunkState:
-    """What a chunk leaves for the next one.
+    """State of the generator from a chunk to the next.
 
     Attributes:
         bits: of its motion, encoded again by itself.
@@ -85,10 +85,10 @@ class ARTalk(ParametricModel):
         still_jaw: set the jaw's rotation about y and z to zero, as they do.
         stage: train the ``codec``, the ``generator`` with the codec as it is, or ``both``; the authors train one after
             the other.
-        options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
+        options: see :class:`~facediff.models.published.parametric.ParametricModel`.
     """
 
-    hears_whole_clips: ClassVar[bool] = False  # but chunks that are cut anew in each step
+    encodes_whole_clips: ClassVar[bool] = False  # but chunks that are cut anew in each step
     jaw_opens: ClassVar[bool] = False
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="facebook/wav2vec2-xls-r-300m", edges=False
@@ -118,9 +118,8 @@ class ARTalk(ParametricModel):
         super().__init__(**options)
         if len(scales) < 2 or scales[0] != 1 or list(scales) != sorted(set(scales)):
             raise ArgumentError({"scales": list(scales)}, "expected growing numbers from 1, such as 1, 5, 25, 50, 100")
-        for width, heads, name in ((dim, num_heads, "dim"), (codec_dim, codec_heads, "codec_dim")):
-            if width % heads:
-                raise ArgumentError({name: width}, "it must be a multiple of its attention heads")
+        check_heads(dim=dim, num_heads=num_heads)
+        check_heads(codec_dim=codec_dim, codec_heads=codec_heads)
         self.scales, self.style_scale = tuple(scales), style_scale
         self.smooth, self.still_jaw, self.stage = smooth, still_jaw, stage
         channels = len(self.modelled)
@@ -144,7 +143,7 @@ class ARTalk(ParametricModel):
                 module.requires_grad_(False)
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
         """The rates, and the statistics by which channels are standardised; there are no shapes of persons."""
         files.tensors |= {name: files[f"basic_vae.{name}"] for name in ("motion_mean", "motion_std")}
         files.tensors["shapes"] = torch.zeros(len(facts.identities), 0)
@@ -189,18 +188,18 @@ class ARTalk(ParametricModel):
         size, frames = self.scales[-1], batch.frame_lengths
         latest = max(1, int(frames.max()) - size // 2)
         first = torch.randint(0, latest, (len(batch),), device=self.device, generator=generator) % frames.clamp_min(1)
-        now, valid = window_at(motion, frames, first, size)
+        chunk, valid = window_at(motion, frames, first, size)
         past, _ = window_at(motion, frames, (first - size).clamp_min(0), size)
         # Before the first frame there is the face at rest, as in generation.
         past = past * (first >= size)[:, None, None]
-        codes = self.codec.encode(torch.cat([past, now], 1))
+        codes = self.codec.encode(torch.cat([past, chunk], 1))
         stands_past, bits_past, _ = self.codec.quantise(codes[:, :size])
         stands, bits, distance = self.codec.quantise(codes[:, size:])
         terms: dict[str, Tensor] = {}
         total = torch.zeros((), device=self.device)
         if self.stage != "generator":
             _, decoded = self.codec.decode_codes(torch.cat([stands_past, stands], 1))
-            error = (decoded - now) / self.codec.motion_std * valid[..., None]
+            error = (decoded - chunk) / self.codec.motion_std * valid[..., None]
             count = (valid.sum() * error.shape[2]).clamp_min(1)
             pairs = valid[:, 1:, None]
             terms["reconstruction"] = error.abs().sum() / count
@@ -215,18 +214,18 @@ class ARTalk(ParametricModel):
                 flipped = self.codec.quantise(codes[:, size:], FLIPPED_BITS)[1] if self.training else bits
                 memory_bits = bits_past.clone()
             style = self.drop(self.style_token(batch), self.generator.no_style)
-            audio = torch.stack([self.hear_chunk(wave) for wave in self.chunk_waves(batch, first)])
+            audio = torch.stack([self.encode_chunk(wave) for wave in self.chunk_waves(batch, first)])
             audio = self.drop(audio, torch.zeros((), device=self.device))
             memory = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(memory_bits))], 1)
             memory = self.drop(memory, self.generator.no_style)
             tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(flipped))], 1)
             logits = self.generator(tokens, memory, audio)
-            counted = self.counted_tokens(valid)
+            token_mask = self.counted_tokens(valid)
             entropy = F.cross_entropy(logits.permute(0, 3, 1, 2), bits, reduction="none").mean(2)
-            terms["bits"] = (entropy * counted).sum() / counted.sum().clamp_min(1)
-            terms["accuracy"] = ((logits.argmax(3) == bits).float().mean(2) * counted).sum() / counted.sum().clamp_min(
-                1
-            )
+            terms["bits"] = (entropy * token_mask).sum() / token_mask.sum().clamp_min(1)
+            terms["accuracy"] = (
+                (logits.argmax(3) == bits).float().mean(2) * token_mask
+            ).sum() / token_mask.sum().clamp_min(1)
             total = total + terms["bits"]
         terms["loss"] = total
         return terms
@@ -237,7 +236,7 @@ class ARTalk(ParametricModel):
         return torch.cat([resized(shares, scale, "area") for scale in self.scales], 1)[..., 0]
 
     def drop(self, values: Tensor, instead: Tensor) -> Tensor:
-        """In training, some clips without what is replaced."""
+        """In training, some clips without this condition."""
         if not self.training:
             return values
         without = torch.rand(len(values), device=values.device) < DROPPED
@@ -259,16 +258,16 @@ class ARTalk(ParametricModel):
         """Samples of a chunk's speech."""
         return int(self.scales[-1] / self.frame_rate * SAMPLE_RATE)
 
-    def hear_chunk(self, wave: Float[Tensor, " samples"]) -> Float[Tensor, "tokens width"]:
-        """What the tokens of a chunk are conditioned on: its speech at all rates."""
+    def encode_chunk(self, wave: Float[Tensor, " samples"]) -> Float[Tensor, "tokens width"]:
+        """Conditions of a chunk's tokens: its speech at all rates."""
         wave = (wave - wave.mean()) / (wave.std() + 1e-6)
         encoder = self.audio_encoder
         if isinstance(encoder, Wav2Vec2Encoder):
-            heard = encoder.hidden_of(wave[None])
+            hidden = encoder.hidden_of(wave[None])
         else:
             lengths, frames = (torch.tensor([count], device=wave.device) for count in (len(wave), self.scales[-1]))
-            heard = encoder.at_steps(wave[None], lengths, frames, "hidden")
-        return torch.cat([resized(heard, scale, "area") for scale in self.scales], 1)[0]
+            hidden = encoder.at_steps(wave[None], lengths, frames, "hidden")
+        return torch.cat([resized(hidden, scale, "area") for scale in self.scales], 1)[0]
 
     # Generation.
 
@@ -291,25 +290,19 @@ class ARTalk(ParametricModel):
     def animate_wave(
         self, audio: Float[Tensor, " samples"], style: Float[Tensor, "1 1 dim"], progress: Progress | None = None
     ) -> tuple[Float[Tensor, "frames channels"], Float[Tensor, "chunks tokens bits 2"]]:
-        """Motion of a recording before it is smoothed, and what the generator gave for the bits of every chunk.
-
-        Args:
-            audio: speech at 16 kHz.
-            style: as :meth:`style_token` gives it.
-            progress: wraps the iteration over chunks.
-        """
+        """Motion of a recording before it is smoothed, and the generator's logits of every chunk's bits."""
         count = max(1, math.ceil(self.frames_of(len(audio)) / self.scales[-1]))
         size = self.chunk_samples
         filled = F.pad(audio, (0, max(0, count * size - len(audio))))
         state, parts, logits = self.begin(style), [], []
         for number in progress(range(count)) if progress is not None else range(count):
-            motion, given, state = self.next_chunk(filled[number * size : (number + 1) * size], style, state)
+            motion, chunk_logits, state = self.next_chunk(filled[number * size : (number + 1) * size], style, state)
             parts.append(motion)
-            logits.append(given)
+            logits.append(chunk_logits)
         return torch.cat(parts)[: self.frames_of(len(audio))], torch.stack(logits)
 
     def begin(self, style: Float[Tensor, "1 1 dim"]) -> ChunkState:
-        """The state before the first chunk: that of motion that is zero."""
+        """The state before the first chunk: of zero motion."""
         rest = style.new_zeros(1, self.scales[-1], len(self.modelled))
         bits = self.codec.bits_of(rest)
         return ChunkState(bits, self.memory_of(bits, style))
@@ -321,13 +314,13 @@ class ARTalk(ParametricModel):
     def next_chunk(
         self, wave: Float[Tensor, " samples"], style: Float[Tensor, "1 1 dim"], state: ChunkState
     ) -> tuple[Float[Tensor, "frames channels"], Float[Tensor, "tokens bits 2"], ChunkState]:
-        """Motion of a chunk, what the generator gave for its bits, and the state for the next chunk."""
-        audio, tokens = self.hear_chunk(wave)[None], style
+        """Motion of a chunk, the generator's logits of its bits, and the state for the next chunk."""
+        audio, tokens = self.encode_chunk(wave)[None], style
         count = 0
         for number, scale in enumerate(self.scales):
             count += scale
             logits = self.generator(tokens, state.memory, audio[:, :count])
-            # All bits are taken anew from every pass, those of coarser rates too, as the authors do.
+            # All bits are taken anew from every pass, coarser rates' too, as the authors do.
             bits = logits.argmax(3)
             if number + 1 < len(self.scales):
                 tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(bits))], 1)
@@ -343,24 +336,24 @@ class ARTalk(ParametricModel):
 
     def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> SpeechStream:  # noqa: ANN401
         """Animate speech of any length while it arrives, chunk by chunk; see the base class."""
-        whole = super().stream(plan=plan, **choices)
-        return ChunkStream(self, whole.clip, seeds=whole.seeds, plan=plan)
+        stream = super().stream(plan=plan, **choices)
+        return ChunkStream(self, stream.clip, seeds=stream.seeds, plan=plan)
 
     def placed(self, motion: Float[Tensor, "frames modelled"]) -> Float[Tensor, "frames channels"]:
-        """What the codec gives as all channels of the space; the others are 0."""
-        whole = motion.new_zeros(len(motion), self.coordinates)
-        whole[:, list(self.modelled)] = motion
-        return whole
+        """The codec's channels among all channels of the space; the others are 0."""
+        frames = motion.new_zeros(len(motion), self.coordinates)
+        frames[:, list(self.modelled)] = motion
+        return frames
 
     def finished(self, motion: Float[Tensor, "frames channels"]) -> Float[Tensor, "frames channels"]:
         """Motion as the authors' programs write it: smoothed, and with a jaw that only opens."""
         if self.smooth:
             motion = torch.from_numpy(smoothed(motion.detach().cpu().numpy(), self.space.head)).to(motion)
         turned = () if self.space.is_vertices else self.space.rotations
-        places = [place for turn in turned if turn.joint == "jaw" for place in turn.channels[1:]]
-        if self.still_jaw and places:
+        jaw = [channel for turn in turned if turn.joint == "jaw" for channel in turn.channels[1:]]
+        if self.still_jaw and jaw:
             motion = motion.clone()
-            motion[:, places] = 0.0
+            motion[:, jaw] = 0.0
         return motion
 
 
@@ -400,7 +393,7 @@ class ChunkStream(PieceStream):
 
     @torch.inference_mode()
     def finish(self, frames: int | None = None) -> Motion:
-        """Give the motion that is left; arguments and errors are those of the base class."""
+        """Give the motion that is left; arguments and errors as in the base class."""
         self._refuse_finished()
         self._finished = True
         end, size = self._first + len(self._raw), self.model.chunk_samples
@@ -408,9 +401,9 @@ class ChunkStream(PieceStream):
         if last > end:
             self._next(F.pad(self._wave, (0, size - len(self._wave))), last - end)
         self._raw = self._raw[: last - self._first]
-        wanted = self._left(last, frames)
-        motion = self._given(last, last)[:, :wanted]
-        return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
+        count = self._left(last, frames)
+        motion = self._given(last, last)[:, :count]
+        return F.pad(motion, (0, 0, 0, 0, 0, count - motion.shape[1]))
 
     def _next(self, wave: Tensor, frames: int) -> None:
         """Animate a chunk, of which so many frames are wanted."""
@@ -426,11 +419,11 @@ class ChunkStream(PieceStream):
     def _given(self, until: int, end: int) -> Motion:
         """The frames up to one that can be smoothed as within the whole recording, of the speech up to another one."""
         start = self.frames
-        finished = self.model.finished(self._raw)[max(0, start - self._first) : max(0, until - self._first)]
-        motion = finished.view(1, len(finished), self.model.n_vertices, self.model.dims)
+        processed = self.model.finished(self._raw)[max(0, start - self._first) : max(0, until - self._first)]
+        motion = processed.view(1, len(processed), self.model.n_vertices, self.model.dims)
         # Frames that later ones are smoothed with stay, and as many as the fit at the very end needs.
-        kept = max(0, min(until - LONGEST_FILTER // 2, end - LONGEST_FILTER))
-        self._raw, self._first = self._raw[max(0, kept - self._first) :], max(kept, self._first)
+        first = max(0, min(until - LONGEST_FILTER // 2, end - LONGEST_FILTER))
+        self._raw, self._first = self._raw[max(0, first - self._first) :], max(first, self._first)
         return self._counted([motion.expand(len(self.seeds), -1, -1, -1)])
 
 
@@ -455,7 +448,7 @@ def smoothed(motion: npt.NDArray[np.float32], head: Sequence[int]) -> npt.NDArra
 
 
 class PastAttention(nn.Module):
-    """Attention of a chunk's tokens to those of the chunk before and to each other, by the angle between them.
+    """Attention of a chunk's tokens to the chunk before's and to each other, by the angle between them.
 
     Args:
         dim: channels.
@@ -472,11 +465,11 @@ class PastAttention(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch tokens dim"], memory: Float[Tensor, "batch past dim"], mask: Tensor
     ) -> Float[Tensor, "batch tokens dim"]:
-        """What is added to the tokens; ``mask`` is added to the scores of past and present tokens."""
-        both = torch.cat([memory, x], 1)
+        """The layer's update of the tokens; ``mask`` is added to the scores of past and present tokens."""
+        sequence = torch.cat([memory, x], 1)
         query, key, value = (
             mapped.unflatten(2, (self.num_heads, -1)).transpose(1, 2)
-            for mapped in (self.query(x), self.key(both), self.value(both))
+            for mapped in (self.query(x), self.key(sequence), self.value(sequence))
         )
         query = F.normalize(query, dim=3) * self.scale.clamp_max(LARGEST_SCALE).exp()
         mixed = F.scaled_dot_product_attention(query, F.normalize(key, dim=3), value, attn_mask=mask, scale=1.0)
@@ -510,7 +503,7 @@ class ModulatedBlock(nn.Module):
 
 
 class BitGenerator(nn.Module):
-    """Bits of a chunk's tokens from the tokens, those of the chunk before, and speech.
+    """Bits of a chunk's tokens from the tokens, the chunk before's, and speech.
 
     Its sizes are options of ``ARTalk``.
     """
@@ -545,7 +538,7 @@ class BitGenerator(nn.Module):
         self.norm = nn.LayerNorm(dim, eps=1e-6, elementwise_affine=False)
         self.bits_out = nn.Linear(dim, 2 * code_dim)
         levels = torch.repeat_interleave(torch.arange(len(scales)), torch.tensor(list(scales)))
-        # A token sees all of the past, and of its own chunk what is as coarse as itself or coarser.
+        # A token sees all of the past, and of its own chunk the tokens as coarse as itself or coarser.
         finer = torch.zeros(count, count).masked_fill(levels[:, None] < levels, -torch.inf)
         self.register_buffer("mask", F.pad(finer, (count, 0)), persistent=False)
         self.register_buffer("levels", levels, persistent=False)
@@ -559,7 +552,7 @@ class BitGenerator(nn.Module):
         """Scores of either value of every bit.
 
         Args:
-            tokens: of the rates so far: the style, then for each finer rate what the coarser ones stand for.
+            tokens: of the rates so far: the style, then for each finer rate the coarser rates' decoded codes.
             memory: tokens of the chunk before.
             audio: speech of the tokens.
         """

@@ -1,6 +1,6 @@
 """ARTalk's codec: motion of 100 frames as bits at several rates in time, and back.
 
-Each rate's bits are the signs of what the coarser ones left over (residual binary spherical quantisation, Zhao et al.
+Each rate's bits are the signs of the coarser rates' residual (residual binary spherical quantisation, Zhao et al.
 2024, "Image and video tokenization with binary spherical quantization").
 """
 
@@ -31,7 +31,7 @@ class CodecAttention(nn.Module):
         self.to_out = nn.Linear(dim, dim)
 
     def forward(self, x: Float[Tensor, "batch frames dim"], mask: Tensor) -> Float[Tensor, "batch frames dim"]:
-        """What is added to the frames."""
+        """The block's update of the frames."""
         query, key, value = self.to_qkv(self.norm(x)).unflatten(2, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
         # Published: by the width of all heads together, and not of one.
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=x.shape[2] ** -0.5)
@@ -109,7 +109,7 @@ class BitCodec(nn.Module):
     def quantise(
         self, codes: Float[Tensor, "batch frames code_dim"], flipped: float = 0.0
     ) -> tuple[Float[Tensor, "batch frames code_dim"], Bits, Tensor]:
-        """What the bits stand for, the bits of all rates, and how far codes are from them (commitment).
+        """The decoded codes, the bits of all rates, and how far codes are from them (commitment).
 
         Args:
             codes: of a chunk.
@@ -122,7 +122,7 @@ class BitCodec(nn.Module):
             distances.append((signs / math.sqrt(self.code_dim) - unit).square().sum(2).mean())
             if flipped:
                 signs = torch.where(torch.rand_like(signs) < flipped, -signs, signs)
-            # The gradient of bits is that of the codes (straight through).
+            # The gradient of bits is the codes' (straight through).
             stands = unit + (signs / math.sqrt(self.code_dim) - unit).detach()
             stands = resized(stands, self.frames, "linear")
             left, total = left - stands.detach(), total + stands
@@ -138,7 +138,7 @@ class BitCodec(nn.Module):
         return (2.0 * bits - 1.0) / math.sqrt(self.code_dim)
 
     def sums(self, bits: Bits) -> list[Float[Tensor, "batch frames code_dim"]]:
-        """What the bits of the first rate stand for, of the first two, and so on as far as there are bits."""
+        """Codes of the bits of the first rate, of the first two, and so on as far as there are bits."""
         values, start, total, result = self.values(bits), 0, torch.zeros((), device=bits.device), []
         for scale in self.scales:
             if start >= bits.shape[1]:
@@ -149,13 +149,13 @@ class BitCodec(nn.Module):
         return result
 
     def inputs_of_next(self, bits: Bits) -> Float[Tensor, "batch tokens code_dim"]:
-        """For every rate but the first: what the coarser ones stand for, at its own rate."""
+        """For every rate but the first: the codes of the coarser ones, at its own rate."""
         sums = self.sums(bits)[: len(self.scales) - 1]
         return torch.cat([resized(total, self.scales[i + 1], "area") for i, total in enumerate(sums)], 1)
 
-    def decode(self, before: Bits, now: Bits) -> tuple[Tensor, Tensor]:
+    def decode(self, before: Bits, bits: Bits) -> tuple[Tensor, Tensor]:
         """Motion (B, frames, channels) of two chunks that follow each other."""
-        codes = torch.cat([self.sums(before)[-1], self.sums(now)[-1]], 1)
+        codes = torch.cat([self.sums(before)[-1], self.sums(bits)[-1]], 1)
         return self.decode_codes(codes)
 
     def decode_codes(self, codes: Float[Tensor, "batch frames code_dim"]) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ own for each frame, so the keys and values of earlier frames never change, and m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -16,11 +16,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import StepRule
 from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress
-from facediff.models.layers import Heads, Layers, Share, Width
+from facediff.models.layers import AttentionContext, Heads, Layers, Share, Width, check_heads
 from facediff.models.published.base import LongSpeech, PublishedModel, still_map
 from facediff.models.published.positions import periodic_bias, periodic_positions
 from facediff.utils.ranges import Range
@@ -37,14 +37,14 @@ class AutoregressiveModel(PublishedModel):
         num_heads: its attention heads.
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
         dropout: in the decoder and on its positions.
-        period: frames after which positions and the attention's bias repeat; those of a second if None.
-        long_speech: what is done with more than 600 frames, for which the published tables have no rows: ``refuse``
+        period: frames after which positions and the attention's bias repeat; a second's if None.
+        long_speech: the treatment of more than 600 frames, for which the published tables have no rows: ``refuse``
             them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
-        options: those of :class:`PublishedModel`.
+        options: see :class:`PublishedModel`.
     """
 
     table_frames: ClassVar[int | None] = 600
-    network: SpokenDecoder
+    network: SpeechDecoder
 
     def __init__(
         self,
@@ -61,8 +61,7 @@ class AutoregressiveModel(PublishedModel):
         super().__init__(**options)
         # The projects' own widths on their two data sets.
         self.dim = dim or (128 if self.pairs else 64)
-        if self.dim % num_heads or self.dim % 2:
-            raise ArgumentError({"dim": self.dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
+        check_heads(dim=self.dim, num_heads=num_heads, even=True)
         self.decoder_options: dict[str, Any] = {
             "dim": self.dim,
             "num_layers": num_layers,
@@ -81,30 +80,29 @@ class AutoregressiveModel(PublishedModel):
             f"exported; export a model that generates all frames in one pass, or animate with facediff animate"
         )
 
-    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
+    def encode_speech(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
         """Speech features: as many as frames, or two for each where speech comes in pairs."""
         # At 25 frames a second two of the 50 speech steps belong to a frame and nothing is interpolated; at 30 the
         # convolutions' output is interpolated before the Transformer, which then runs at the motion's rate.
         steps = 2 * frames if self.pairs else frames
         rule: StepRule = "features_cut" if self.pairs else "features"
-        cached = batch.cached_features or ()
-        return self.audio_encoder.at_steps(batch.audio, batch.audio_lengths, steps, rule, *cached)
+        return self.speech_features(batch, steps, rule)
 
     def conditions(
         self, batch: Batch, frames: Int[Tensor, " batch"]
     ) -> tuple[Float[Tensor, "batch dim"], Float[Tensor, "batch steps dim"]]:
         """The speaker's style and the speech of so many frames."""
-        memory = self.network.audio_map(self.hear(batch, frames))
+        memory = self.network.audio_map(self.encode_speech(batch, frames))
         return self.network.style(self.identity_weights(batch)), memory
 
 
 class OffsetModel(AutoregressiveModel):
-    """Base of those whose decoder gives the offsets themselves, of an :class:`AutoregressiveNetwork`.
+    """Base of methods with a decoder of the offsets themselves, an :class:`AutoregressiveNetwork`.
 
     Args:
         teacher_forcing: train on the true motion of the frame before, in one pass, and not on the generated one; the
             published training generates.
-        options: those of :class:`AutoregressiveModel`.
+        options: see :class:`AutoregressiveModel`.
     """
 
     network: AutoregressiveNetwork
@@ -141,15 +139,8 @@ class OffsetModel(AutoregressiveModel):
         return self.offsets_of(motion)
 
 
-class ProjectedKeysValues(NamedTuple):
-    """Keys and values of some positions, both (batch, heads, positions, head_dim)."""
-
-    key: Tensor
-    value: Tensor
-
-
 class ProjectedAttention(nn.Module):
-    """Multi-head attention whose queries, keys and values come from one stacked map, as in PyTorch's own layer.
+    """Multi-head attention with one stacked map for queries, keys and values, as in PyTorch's own layer.
 
     Args:
         dim: channels.
@@ -173,34 +164,34 @@ class ProjectedAttention(nn.Module):
         dim = x.shape[-1]
         return self._split(F.linear(x, self.project.weight[:dim], self.project.bias[:dim]))
 
-    def keys_values(self, x: Float[Tensor, "batch positions dim"]) -> ProjectedKeysValues:
+    def keys_values(self, x: Float[Tensor, "batch positions dim"]) -> AttentionContext:
         """The second and the last third."""
         dim = x.shape[-1]
         key, value = F.linear(x, self.project.weight[dim:], self.project.bias[dim:]).chunk(2, -1)
-        return ProjectedKeysValues(self._split(key), self._split(value))
+        return AttentionContext(self._split(key), self._split(value))
 
-    def attend(self, query: Tensor, context: ProjectedKeysValues, bias: Tensor | None = None) -> Tensor:
-        """The attention itself, whose scores get ``bias``, and the map of its result."""
+    def attend(self, query: Tensor, context: AttentionContext, bias: Tensor | None = None) -> Tensor:
+        """The attention itself, with ``bias`` added to its scores, and the map of its result."""
         dropout = self.dropout if self.training else 0.0
         bias = None if bias is None else bias.to(query.dtype)
         mixed = F.scaled_dot_product_attention(query, context.key, context.value, attn_mask=bias, dropout_p=dropout)
         return self.out(mixed.transpose(1, 2).flatten(2))
 
-    def attend_own(self, query: Tensor, context: ProjectedKeysValues) -> Tensor:
+    def attend_own(self, query: Tensor, context: AttentionContext) -> Tensor:
         """Each position attends to its own moment alone: the context's positions divided among the queries."""
         batch, heads, frames, width = query.shape
         # The same as a mask that leaves only these positions, without the table of all others.
         queries = query.transpose(1, 2).reshape(batch * frames, heads, 1, width)
-        own = ProjectedKeysValues(
+        per_frame = AttentionContext(
             *(part.view(batch, heads, frames, -1, width).transpose(1, 2).flatten(0, 1) for part in context)
         )
-        return self.attend(queries, own).view(batch, frames, -1)
+        return self.attend(queries, per_frame).view(batch, frames, -1)
 
     def _split(self, x: Tensor) -> Tensor:
         return x.view(*x.shape[:-1], self.num_heads, -1).transpose(1, 2)
 
 
-class SpokenLayer(nn.Module):
+class SpeechDecoderLayer(nn.Module):
     """The parts of a layer of a decoder: self-attention, attention to the speech, feed-forward.
 
     Args:
@@ -219,24 +210,17 @@ class SpokenLayer(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
 
-class DecoderLayer(SpokenLayer):
+class DecoderLayer(SpeechDecoderLayer):
     """Each part's result is added to the frames, which are normalised afterwards."""
 
-    def forward(self, x: Tensor, speech: ProjectedKeysValues, past: ProjectedKeysValues, bias: Tensor | None) -> Tensor:
-        """Frames ``x`` (B, T, dim) that see the positions of ``past`` as the ``bias`` (heads, T, P) lets them.
-
-        Args:
-            x: the frames' tokens.
-            speech: keys and values of these frames' own moments of the speech.
-            past: keys and values of all frames that they may see, themselves included.
-            bias: added to the attention's scores.
-        """
+    def forward(self, x: Tensor, speech: AttentionContext, past: AttentionContext, bias: Tensor | None) -> Tensor:
+        """Frames ``x`` (B, T, dim) that see the positions of ``past`` as the ``bias`` (heads, T, P) lets them."""
         # Post-norm with a ReLU, the defaults of torch.nn.TransformerDecoderLayer when these methods were published; the
         # released weights do not fit a pre-norm layer.
-        heard = self.self_attention.attend(self.self_attention.queries(x), past, bias)
-        x = self.norms[0](x + self.dropout(heard))
-        heard = self.cross_attention.attend_own(self.cross_attention.queries(x), speech)
-        x = self.norms[1](x + self.dropout(heard))
+        attended = self.self_attention.attend(self.self_attention.queries(x), past, bias)
+        x = self.norms[0](x + self.dropout(attended))
+        attended = self.cross_attention.attend_own(self.cross_attention.queries(x), speech)
+        x = self.norms[1](x + self.dropout(attended))
         hidden = self.second(self.dropout(torch.relu(self.first(x))))
         return self.norms[2](x + self.dropout(hidden))
 
@@ -272,7 +256,7 @@ class PeriodicDecoder(nn.Module):
         return periodic_positions(frames, self.dim, self.period, start=start, device=self.device)
 
     def bias(self, frames: int, start: int = 0) -> Float[Tensor, "heads frames positions"]:
-        """What the scores of frames ``start`` to ``start + frames`` get: less the older a frame, −∞ for later ones."""
+        """Bias of the scores of frames ``start`` to ``start + frames``: less the older a frame, −∞ for later ones."""
         return periodic_bias(frames, self.num_heads, self.period, start=start, device=self.device)
 
     def forward(
@@ -302,12 +286,12 @@ class Continuation:
         frames: how many will be made.
     """
 
-    def __init__(self, decoder: PeriodicDecoder, speech: list[ProjectedKeysValues], frames: int) -> None:
+    def __init__(self, decoder: PeriodicDecoder, speech: list[AttentionContext], frames: int) -> None:
         self.decoder, self.speech, self.frame = decoder, speech, 0
         self._keys: list[list[Tensor]] = [[] for _ in decoder.layers]
         self._values: list[list[Tensor]] = [[] for _ in decoder.layers]
         self._positions, self._room = decoder.positions(frames), frames
-        self._kept: list[ProjectedKeysValues] | None = None
+        self._kept: list[AttentionContext] | None = None
 
     def step(self, token: Float[Tensor, "batch 1 dim"]) -> Float[Tensor, "batch 1 dim"]:
         """The next frame; its position is added to the token here."""
@@ -317,33 +301,33 @@ class Continuation:
         x, bias = decoder.dropout(token + self._positions[at]), decoder.bias(1, at)
         for number, layer in enumerate(decoder.layers):
             past = self._with(number, layer.self_attention.keys_values(x))  # type: ignore[union-attr, operator]
-            speech = ProjectedKeysValues(*(part[:, :, at * steps : (at + 1) * steps] for part in self.speech[number]))
+            speech = AttentionContext(*(part[:, :, at * steps : (at + 1) * steps] for part in self.speech[number]))
             x = layer(x, speech, past, bias)
         self.frame += 1
         return x
 
-    def _with(self, number: int, new: ProjectedKeysValues) -> ProjectedKeysValues:
+    def _with(self, number: int, new: AttentionContext) -> AttentionContext:
         """Keys and values of a layer up to the present frame."""
         if torch.is_grad_enabled():  # what a gradient goes through must not be written over
             keys, values = self._keys[number], self._values[number]
             keys.append(new.key)
             values.append(new.value)
-            return ProjectedKeysValues(torch.cat(keys, 2), torch.cat(values, 2))
+            return AttentionContext(torch.cat(keys, 2), torch.cat(values, 2))
         # Room for all frames is taken once. Concatenating in every frame would copy all earlier keys and values again,
         # which for T frames is work of the order T².
         if self._kept is None:
             batch, heads, _, width = new.key.shape
             self._kept = [
-                ProjectedKeysValues(*(new.key.new_empty(batch, heads, self._room, width) for _ in range(2)))
+                AttentionContext(*(new.key.new_empty(batch, heads, self._room, width) for _ in range(2)))
                 for _ in self.decoder.layers
             ]
-        kept = self._kept[number]
-        for store, part in zip(kept, new, strict=True):
+        cache = self._kept[number]
+        for store, part in zip(cache, new, strict=True):
             store[:, :, self.frame : self.frame + 1] = part
-        return ProjectedKeysValues(*(store[:, :, : self.frame + 1] for store in kept))
+        return AttentionContext(*(store[:, :, : self.frame + 1] for store in cache))
 
 
-class SpokenDecoder(nn.Module):
+class SpeechDecoder(nn.Module):
     """Maps of speech and of earlier motion into a decoder; what stands behind it is added by a method.
 
     Attributes:
@@ -374,7 +358,7 @@ class SpokenDecoder(nn.Module):
         return features
 
 
-class AutoregressiveNetwork(SpokenDecoder):
+class AutoregressiveNetwork(SpeechDecoder):
     """Features of speech and a speaker's style to offsets of the vertices, frame by frame.
 
     Args:

@@ -1,4 +1,4 @@
-"""What the field's published methods have in common: each of them adds its network, its loss and its inference.
+"""Common parts of the field's published methods: each of them adds its network, its loss and its inference.
 
 They encode speech by a pretrained network at 50 steps a second, count their frames by it, know a speaker as one
 column of a table, and train on motion as it is, without a scale, one clip at a time.
@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from facediff.data import Batch, Reference
 from facediff.errors import ArgumentError, FaceDiffError, OptionError
-from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory
+from facediff.hyperparameters import component_class
+from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, StepRule
 from facediff.models.base import AnimationModel, Decay
 from facediff.models.checkpoint_content import MotionScale
 from facediff.models.evaluation import IdentityPolicy
@@ -31,7 +32,7 @@ from facediff.models.graphs import (
     ModelPart,
     SamplingLoop,
     Speech,
-    Spoken,
+    SpeechInput,
     StyleSource,
     results_of,
     speech_graph,
@@ -40,13 +41,14 @@ from facediff.models.inference import BatchMotion, Progress, Style
 from facediff.models.layers import Width, frame_mask
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import FrameClock, Rule
+from facediff.utils.hints import fits, options_of
 
 if TYPE_CHECKING:
     from facediff.models.published.cards import AuthorFiles, Facts
     from facediff.models.published.import_options import ImportOptions
 
 LongSpeech = Literal["refuse", "windows", "extend"]
-"""What is done with speech beyond the tables of the published code."""
+"""The treatment of speech beyond the tables of the published code."""
 
 TRAINED_NETWORK = partial(Wav2Vec2Encoder, spec_augment=True, layer_drop=0.1, edges=False)
 """A pretrained speech network as most of the methods train it: all but its convolutions, with masks and layer drop."""
@@ -76,10 +78,10 @@ class PublishedModel(AnimationModel):
         weight_decay: AdamW's; the published methods train with Adam, which is AdamW with a decay of 0.
         unseen_identity: as in the same class; the published methods condition an unseen speaker on each training
             identity in turn.
-        options: those of every model, see :class:`facediff.models.AnimationModel`.
+        options: of every model, see :class:`facediff.models.AnimationModel`.
     """
 
-    hears_all: ClassVar[bool] = True
+    counts_own_frames: ClassVar[bool] = True
     published_encoder: ClassVar[AudioEncoderFactory]
     table_frames: ClassVar[int | None] = None
     clock_rule: ClassVar[Rule | None] = None
@@ -118,16 +120,16 @@ class PublishedModel(AnimationModel):
 
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the arguments as every model does, with the published audio encoder where none was given."""
-        chosen = arguments.get("audio_encoder")
-        super().keep_hyperparameters({**arguments, "audio_encoder": chosen or self.published_encoder})
+        encoder = arguments.get("audio_encoder")
+        super().keep_hyperparameters({**arguments, "audio_encoder": encoder or self.published_encoder})
 
     @classmethod
     def encoder_settings(cls) -> dict[str, Any]:
-        """Options of the published encoder but for whose weights it has, for a checkpoint that brings its own."""
+        """Options of the published encoder without the source of its weights, for a checkpoint that brings its own."""
         keywords: dict[str, Any] = cls.published_encoder.keywords  # type: ignore[attr-defined]
         return {name: value for name, value in keywords.items() if name != "source"}
 
-    # What a method adds.
+    # For a method to implement.
 
     @classmethod
     def author_facts(cls, files: AuthorFiles, options: ImportOptions) -> Facts | None:  # noqa: ARG003
@@ -135,14 +137,8 @@ class PublishedModel(AnimationModel):
         return None
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:  # noqa: ARG003
-        """Change an author's tensors as no table of names can; the options of the model that follow.
-
-        Args:
-            files: the tensors.
-            facts: faces and data.
-            asked: options of the import and of the model that the user gives.
-        """
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:  # noqa: ARG003
+        """Change an author's tensors as no table of names can; the options of the model that follow."""
         return {}
 
     @abstractmethod
@@ -158,7 +154,7 @@ class PublishedModel(AnimationModel):
             progress: wraps the iteration over steps.
 
         Returns:
-            motion of ``frames.max()`` frames; what it is beyond a clip's own frames has no meaning.
+            motion of ``frames.max()`` frames; beyond a clip's own frames it has no meaning.
         """
 
     # The audio encoder and the clock of speech.
@@ -175,7 +171,7 @@ class PublishedModel(AnimationModel):
         return FrameClock(self.frame_rate, "pairs" if self.pairs else "steps", self.audio_encoder.convolutions())
 
     def plan_long_speech(self, long_speech: LongSpeech) -> None:
-        """Choose what is done with speech beyond the published tables: by windows only where that is chosen."""
+        """Choose the treatment of speech beyond the published tables: by windows only where that is chosen."""
         self.long_speech = long_speech
         by_windows = long_speech == "windows" and self.table_frames is not None
         above = (self.table_frames or 0) / self.frame_rate if by_windows else math.inf
@@ -183,10 +179,10 @@ class PublishedModel(AnimationModel):
 
     def check_length(self, frames: Int[Tensor, " batch"], names: Sequence[str]) -> None:
         """Refuse clips of more frames than the published tables have, with what to do instead."""
-        most, rows = int(frames.max()), self.table_frames
-        if rows is not None and most > rows and self.long_speech != "extend":
+        longest, rows = int(frames.max()), self.table_frames
+        if rows is not None and longest > rows and self.long_speech != "extend":
             raise OptionError.naming(
-                f"{names[int(frames.argmax())]}: {most / self.frame_rate:.1f} s are {most} frames, and "
+                f"{names[int(frames.argmax())]}: {longest / self.frame_rate:.1f} s are {longest} frames, and "
                 f"{type(self).__name__}'s published tables have {rows} ({rows / self.frame_rate:g} s); animate it in "
                 f"windows ({{window}} 4), or make the model with long_speech=extend or long_speech=windows"
             )
@@ -202,6 +198,13 @@ class PublishedModel(AnimationModel):
             return lengths
         steps = torch.tensor([self.steps_of(int(n)) // 2 for n in batch.audio_lengths], device=lengths.device)
         return torch.minimum(lengths, steps.clamp_min(1))
+
+    def speech_features(
+        self, speech: SpeechInput, steps: Int[Tensor, " batch"], rule: StepRule
+    ) -> Float[Tensor, "batch steps width"]:
+        """The audio encoder's features at so many steps of each clip."""
+        cached = speech.cached_features or ()
+        return self.audio_encoder.at_steps(speech.audio, speech.audio_lengths, steps, rule, *cached)
 
     # The speaker.
 
@@ -221,8 +224,8 @@ class PublishedModel(AnimationModel):
 
     def weights_of(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identities"]:
         """One-hot rows of identities; of an unknown speaker (−1) :meth:`unknown_weights`."""
-        places = torch.arange(len(self.identities), device=identity.device)
-        one_hot = (identity[:, None] == places).float()
+        rows = torch.arange(len(self.identities), device=identity.device)
+        one_hot = (identity[:, None] == rows).float()
         return torch.where(identity[:, None] >= 0, one_hot, self.unknown_weights().to(one_hot))
 
     def unknown_weights(self) -> Float[Tensor, " identities"]:
@@ -248,14 +251,14 @@ class PublishedModel(AnimationModel):
     # Inference.
 
     def generate_clips(self, batch: Batch, *, seed: int = 0, progress: Progress | None = None) -> BatchMotion:
-        """The method's own number of frames for each clip, whose last one is held as long as the clip lasts.
+        """The method's own number of frames for each clip; the last one is held as long as the clip lasts.
 
         The published methods give a frame less than the motion has, or two; scores count all frames of the truth.
         """
-        frames = torch.tensor([max(1, own) for own in self.tested_frames(batch)], device=batch.audio.device)
+        frames = torch.tensor([max(1, count) for count in self.tested_frames(batch)], device=batch.audio.device)
         seeds = [zlib.crc32(name.encode()) + seed for name in batch.names]
         motion = self.generate_frames(batch, frames, seeds=seeds, progress=progress)
-        return held(motion, frames, batch.frame_lengths)
+        return hold_last_frame(motion, frames, batch.frame_lengths)
 
     def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None) -> BatchMotion:
         """Several samples of one clip; a method without noise makes one."""
@@ -263,16 +266,22 @@ class PublishedModel(AnimationModel):
         frames = torch.tensor([max(1, self.frames_of(int(clip.audio_lengths[0])))] * count, device=clip.audio.device)
         clips = clip if count == 1 else clip.select([0] * count)
         generated = self.generate_frames(clips, frames, seeds=list(seeds)[:count], progress=progress)
-        motion = held(generated, frames, clip.frame_lengths.expand(count))
+        motion = hold_last_frame(generated, frames, clip.frame_lengths.expand(count))
         return motion if self.samples else motion.expand(len(seeds), -1, -1, -1)
 
 
 class DirectModel(PublishedModel):
-    """Base of the published methods that generate all frames in one pass, without random numbers."""
+    """Base of the published methods that generate all frames in one pass, without random numbers.
 
-    @abstractmethod
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames *width"]:
+    Class attributes:
+        step_rule: how speech is brought to the frames.
+    """
+
+    step_rule: ClassVar[StepRule] = "features"
+
+    def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames *width"]:
         """Speech features of each frame."""
+        return self.speech_features(speech, frames, self.step_rule)
 
     @abstractmethod
     def decode(
@@ -281,29 +290,34 @@ class DirectModel(PublishedModel):
         weights: Float[Tensor, "batch identities"],
         frames: Int[Tensor, " batch"] | None,
     ) -> Float[Tensor, "batch frames coordinates"]:
-        """Scaled motion.
+        """Scaled motion."""
 
-        Args:
-            features: as :meth:`hear` gives them.
-            weights: as :meth:`identity_weights` gives them.
-            frames: valid ones of each clip; None if all are.
-        """
+    def penalty(self, difference: Float[Tensor, "batch frames coordinates"]) -> Tensor:
+        """The error of each number in training: its square."""
+        return difference.square()
+
+    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+        """The mean of :meth:`penalty`."""
+        frames = self.trained_frames(batch)
+        predicted = self.decode(self.encode_speech(batch, frames), self.identity_weights(batch), frames)
+        error = masked_mean(self.penalty(predicted - self.scaled_truth(batch, frames)), frames)
+        return {"reconstruction": error, "loss": error}
 
     def generate_frames(
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
         """All frames in one pass; nothing is random."""
-        motion = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
+        motion = self.decode(self.encode_speech(batch, frames), self.identity_weights(batch), frames)
         return self.offsets_of(motion)
 
     @property
-    def heard_steps(self) -> int:
+    def speech_steps(self) -> int:
         """Steps that the audio encoder is asked for, for each frame."""
         return 1
 
     @property
     def unexported(self) -> str:
-        """Options that were chosen and change what the network gives, which no graph does; none by default."""
+        """Options that were chosen and change the network's output, which no graph does; none by default."""
         return ""
 
     def graphs(self) -> Graphs:
@@ -350,10 +364,10 @@ class DirectMotion(ModelPart[DirectModel]):
 def direct_graphs(model: DirectModel) -> Graphs:
     """The graphs of a method that generates all frames in one pass."""
 
-    def hear(heard: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
-        return model.hear(heard, frames)
+    def encode(speech: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
+        return model.encode_speech(speech, frames)
 
-    speech = speech_graph(model, hear, lambda frames: model.heard_steps * frames)
+    speech = speech_graph(model, encode, lambda frames: model.speech_steps * frames)
     features = results_of(speech)
     inputs: dict[str, Any] = {"features": features, "identity": zeros(len(features))}
     motion = Graph("motion", DirectMotion(model), inputs, {"features": FRAMES, "identity": BATCH}, ("offsets",))
@@ -402,23 +416,20 @@ def still_map(dim: int, coordinates: int) -> nn.Linear:
 
 def make_encoder(factory: AudioEncoderFactory, dim: int | None) -> tuple[AudioEncoder, int]:
     """An audio encoder and its channels, which it must be told unless it knows them by itself."""
-    try:
-        encoder = factory(dim=dim)  # type: ignore[arg-type]
-    except ArgumentError as error:
-        if dim is None and "dim" in error.values:
-            raise ArgumentError({"audio_dim": dim}, "the audio encoder's channels; give them, e.g. 64") from error
-        raise
+    if dim is None and not fits(options_of(component_class(factory))["dim"].annotation, None):
+        raise ArgumentError({"audio_dim": dim}, "the audio encoder's channels; give them, e.g. 64")
+    encoder = factory(dim=dim)  # type: ignore[arg-type]
     width: int = getattr(encoder, "width", dim or 0)
     return encoder, width
 
 
-def held(motion: BatchMotion, frames: Int[Tensor, " batch"], lengths: Int[Tensor, " batch"]) -> BatchMotion:
+def hold_last_frame(motion: BatchMotion, frames: Int[Tensor, " batch"], lengths: Int[Tensor, " batch"]) -> BatchMotion:
     """Motion of ``lengths`` frames of each clip: cut, or with its last frame held; zero on padding."""
     longest = int(lengths.max())
     # An index past the last frame becomes the last frame, which holds it.
-    places = torch.arange(longest, device=motion.device)[None].minimum(frames[:, None] - 1)
+    indices = torch.arange(longest, device=motion.device)[None].minimum(frames[:, None] - 1)
     rows = torch.arange(len(motion), device=motion.device)[:, None]
-    return motion[rows, places] * frame_mask(lengths, longest)[..., None, None]
+    return motion[rows, indices] * frame_mask(lengths, longest)[..., None, None]
 
 
 def masked_mean(values: Float[Tensor, "batch frames ..."], frames: Int[Tensor, " batch"]) -> Float[Tensor, ""]:

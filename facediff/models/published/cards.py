@@ -1,14 +1,14 @@
-"""Release cards: what is known of the checkpoints that the published methods' authors distribute.
+"""Release cards: facts about the checkpoints that the published methods' authors distribute.
 
 A card (``releases/*.yaml``) says by which tensors a checkpoint is recognised, what its tensors are called here, which
-sizes can be read from them, and its licence. What no table says is code of the method, in
+sizes can be read from them, and its licence. Conversions beyond a table are code of the method, in
 :meth:`PublishedModel.read_author`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -18,14 +18,15 @@ import torch
 import yaml
 from torch import Tensor
 
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import OptionError
 from facediff.models.published.positions import periodic_positions
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import VERTICES, Space
+from facediff.utils.hints import is_name
 from facediff.utils.licences import Commercial, Licence
 
 Renames = tuple[tuple[str, str], ...]
-"""Regular expressions and what replaces them, each applied in turn."""
+"""Regular expressions with their replacements, each applied in turn."""
 
 LAYER_NAMES: Renames = (
     (r"self_attn\.in_proj_", "self_attention.project."),
@@ -38,7 +39,7 @@ LAYER_NAMES: Renames = (
     (r"norm2", "norms.1"),
     (r"norm3", "norms.2"),
 )
-"""The tensors of PyTorch's decoder layer, as those of ``autoregressive.DecoderLayer`` are called."""
+"""From the tensors' names in PyTorch's decoder layer to those in ``autoregressive.DecoderLayer``."""
 
 ENCODER_NAMES: Renames = (
     ("weight_g$", "parametrizations.weight.original0"),
@@ -56,7 +57,7 @@ BACKBONE: dict[str, tuple[str, int]] = {
 
 @dataclass(frozen=True)
 class Card:
-    """What is known of a method's checkpoints.
+    """Facts about a method's checkpoints.
 
     Attributes:
         method: the model's registered name.
@@ -69,14 +70,14 @@ class Card:
             and its ``kind``.
         options: of the model: a value, tensor and axis with a size, or the beginning of names that count layers.
         renames: from the authors' names to the model's.
-        layers: beginning of the model's names whose rest is renamed by :data:`LAYER_NAMES`.
+        layers: beginning of the model's names that are renamed by :data:`LAYER_NAMES`.
         transposed: tensors that the model has transposed, by its names.
         positions: table of positions, computed by its formula here, which tells the frame rate.
-        period: of that table; that of the frame rate if 0.
+        period: of that table; the rounded frame rate if 0.
         ignored: beginnings of names that are not needed, and why.
         layout: of the channels, by :func:`facediff.spaces.layouts.layout`; empty where vertices are animated.
-        frame_rate: frames a second, where they are not those of the data set; the option ``frame_rate`` changes it.
-        reads: the options of the import that the method reads, but for those of all methods.
+        frame_rate: frames a second, where they differ from the data set's; the option ``frame_rate`` changes it.
+        reads: the options of the import that the method reads, beside the options of all methods.
         releases: the released files with their data set and options.
         like: another card with the same renames and ignored names.
         licence: of the weights.
@@ -114,15 +115,15 @@ class Card:
         """The card of a file."""
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
         if "like" in content:
-            other = yaml.safe_load(path.with_name(f"{content['like']}.yaml").read_text(encoding="utf-8"))
-            content |= {name: other[name] for name in ("renames", "ignored", "layers")}
+            base_card = yaml.safe_load(path.with_name(f"{content['like']}.yaml").read_text(encoding="utf-8"))
+            content |= {name: base_card[name] for name in ("renames", "ignored", "layers")}
         fields: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value for name, value in content.items()
         }
         return cls(**fields)
 
     def fits(self, names: Mapping[str, Tensor]) -> bool:
-        """Whether tensors are those of this method."""
+        """Whether tensors are of this method."""
         return all(name in names for name in self.required) and not any(
             name.startswith(self.forbidden) for name in names if self.forbidden
         )
@@ -154,19 +155,11 @@ class AuthorFiles:
 
     def __getitem__(self, name: str) -> Tensor:
         """A tensor."""
-        if name not in self.tensors:
-            raise FaceDiffError(
-                f"{self.source}: lacks the tensor {name} of {self.card.method}; give the whole checkpoint, as its "
-                f"authors distribute it"
-            )
         return self.tensors[name]
 
     def size(self, name: str, axis: int) -> int:
         """A size of a tensor."""
-        shape = self[name].shape
-        if axis >= len(shape):
-            raise FaceDiffError(f"{self.source}: its tensor {name} has the shape {tuple(shape)}; expected another")
-        return shape[axis]
+        return self[name].shape[axis]
 
     def beginning(self, prefix: str | tuple[str, ...]) -> list[str]:
         """The names that begin so."""
@@ -177,7 +170,7 @@ class AuthorFiles:
         return len({name.removeprefix(prefix).split(".")[0] for name in self.beginning(prefix)})
 
     def ignore(self, prefix: str, why: str) -> None:
-        """Leave out all tensors whose names begin so, and report it."""
+        """Leave out all tensors with this prefix, and report it."""
         for name in self.beginning(prefix):
             self.ignored[name] = why
             del self.tensors[name]
@@ -195,7 +188,7 @@ class AuthorFiles:
         return options
 
     def check_positions(self, frame_rate: float, dataset: str) -> None:
-        """Leave out the table of positions, once it is seen to be that of the frame rate."""
+        """Leave out the table of positions, once it agrees with the frame rate."""
         name = self.card.positions
         if name not in self.tensors:
             return
@@ -212,9 +205,9 @@ class AuthorFiles:
         """Move the tensors of a complete wav2vec 2.0, HuBERT or WavLM under ``into``; its configuration.
 
         Args:
-            into: what the model calls the network, with the dot.
-            stated: the network's configuration, where the user gives it, or those of several networks by name; sizes
-                follow from the tensors all the same.
+            into: the model's name of the network.
+            stated: the network's configuration, where the user gives it, or configurations of several networks by
+                name; sizes follow from the tensors all the same.
         """
         entry = self.card.encoders.get(into) or {"prefix": f"{into}.", "kind": "wav2vec2"}
         prefix, first = entry["prefix"], "feature_extractor.conv_layers.0.conv.weight"
@@ -248,18 +241,14 @@ class AuthorFiles:
             else kind,
         }
         config = {"do_stable_layer_norm": large, **stated, **sizes}
-        if "num_attention_heads" not in config:
-            if sizes["hidden_size"] % 64:
+        follow = {"num_attention_heads": sizes["hidden_size"] % 64 == 0, "conv_stride": len(convolutions) == 7}
+        for name, follows in follow.items():
+            if name not in config and not follows:
                 raise OptionError.naming(
-                    f"{self.source}: its speech network has {sizes['hidden_size']} channels, from which the number of "
-                    f"its attention heads does not follow; give {{audio_config}} config.json with num_attention_heads"
+                    f"{self.source}: {name} does not follow from {sizes['hidden_size']} channels and "
+                    f"{len(convolutions)} convolutions; give {{audio_config}} config.json with it"
                 )
-            config["num_attention_heads"] = sizes["hidden_size"] // 64
-        if "conv_stride" not in config and len(convolutions) != 7:
-            raise OptionError.naming(
-                f"{self.source}: its speech network has {len(convolutions)} convolutions, from which their strides do "
-                f"not follow; give {{audio_config}} config.json with conv_stride"
-            )
+        config.setdefault("num_attention_heads", sizes["hidden_size"] // 64)
         # The network has a place for the vector that SpecAugment writes on masked steps only where it is to mask.
         masked = f"{prefix}masked_spec_embed" in self.tensors
         if not masked or not (config.get("mask_time_prob") or config.get("mask_feature_prob")):
@@ -267,18 +256,13 @@ class AuthorFiles:
         return config
 
     def encoder(self, stated: Mapping[str, Any] | None, settings: Mapping[str, Any]) -> partial[Any]:
-        """The audio encoder of the tensors.
-
-        Args:
-            stated: its network's configuration, where the user gives it.
-            settings: its options, such as ``epsilon``.
-        """
+        """The audio encoder of the tensors."""
         config = self.speech_network("audio_encoder", stated)
         spec_augment = bool(settings.get("spec_augment")) and "audio_encoder.network.masked_spec_embed" in self.tensors
         return partial(Wav2Vec2Encoder, config=config, **{**settings, "spec_augment": spec_augment})
 
     def renamed(self) -> dict[str, Tensor]:
-        """The tensors by the model's names; what no rename fits keeps its name."""
+        """The tensors by the model's names; one that no rename fits keeps its name."""
         result: dict[str, Tensor] = {}
         for name, value in self.tensors.items():
             new = (
@@ -305,18 +289,18 @@ def renamed(name: str, renames: Renames) -> str:
 
 @dataclass
 class Facts:
-    """What no tensor says: whose faces a checkpoint animates, and how.
+    """Facts that no tensor holds: the faces that a checkpoint animates, and how.
 
     Attributes:
-        dataset: what it was trained on.
+        dataset: of its training.
         frame_rate: frames a second.
         identities: training identities in the order of the table's rows.
         templates: neutral faces (points, dims) by name.
         space: of the motion.
         unit: unit of length.
-        licences: of the data; those of the corpus if empty.
-        notes: what the user should know.
-        details: what the method reads the tensors with.
+        licences: of the data; the corpus's if empty.
+        notes: for the user.
+        details: values with which the method reads the tensors.
     """
 
     dataset: str
@@ -334,3 +318,14 @@ class Facts:
         points = len(next(iter(self.templates.values())))
         space = {} if self.space.is_vertices else {"space": self.space}
         return {"n_vertices": points, "identities": self.identities, "frame_rate": self.frame_rate, **space}
+
+
+def identities_of(identities: Sequence[str] | None, count: int, defaults: list[str]) -> list[str]:
+    """The training identities: the user's, or the data set's."""
+    names = defaults if identities is None else list(identities)
+    if (count and len(names) != count) or len(set(names)) < len(names) or not all(map(is_name, names)):
+        raise OptionError.naming(
+            f"{{identities}}: {len(names)} names are {'usual' if identities is None else 'given'}; expected "
+            f"{count or len(names)} different ones without path separators, in the order of the training command"
+        )
+    return names

@@ -2,8 +2,8 @@
 
 Xing, Xia, Zhang, Cun, Wang, Wong: "CodeTalker: Speech-Driven 3D Facial Animation with Discrete Motion Prior". Two
 stages of one model: a prior, which learns to write motion in a table of codes (``motion_prior.py``), and a predictor,
-FaceFormer's decoder, which finds the codes that speech asks for. docs/methods.md says what of the published code is an
-option here.
+FaceFormer's decoder, which finds the codes that speech asks for. docs/methods.md lists the options
+for choices of the published code.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, Reference
-from facediff.errors import ArgumentError, FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError, damaged
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, Lengths, Waves
 from facediff.models.base import AnimationModel
 from facediff.models.checkpoint_content import IMPORTED
 from facediff.models.inference import BatchMotion, Motion, Progress, Style
 from facediff.models.layers import Frames, Heads, Layers, Width, frame_mask
-from facediff.models.published.autoregressive import AutoregressiveModel, SpokenDecoder
+from facediff.models.published.autoregressive import AutoregressiveModel, SpeechDecoder
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, masked_mean
 from facediff.models.published.motion_prior import MotionPrior, perplexity
 from facediff.models.squared_errors import mean_squared_error
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from facediff.models.published.cards import AuthorFiles, Facts
 
 Stage = Literal["prior", "predictor"]
-"""What is trained: the autoencoder of motion, or what finds its codes by the speech."""
+"""The trained part: the autoencoder of motion, or the predictor of its codes from speech."""
 
 History = Literal["true", "own"]
 """Which frames the predictor continues in training: the true ones, or those that it makes itself."""
@@ -57,7 +57,7 @@ class CodeTalker(AutoregressiveModel):
 
     Args:
         stage: ``prior`` is the autoencoder alone; ``predictor`` trains what finds its codes, and leaves it as it is.
-        prior: checkpoint whose prior a new predictor is trained with; its sizes must be this model's.
+        prior: checkpoint that gives the prior of a new predictor; its sizes must be this model's.
         dim: channels of the predictor; 1024 if None.
         num_layers: its layers; 12 at 25 frames a second (BIWI) and 6 otherwise if None.
         prior_dim: channels of the prior's two halves.
@@ -68,14 +68,14 @@ class CodeTalker(AutoregressiveModel):
         token_dim: channels of a code; an equal part of ``prior_dim`` if None.
         codes: rows of the table of codes.
         leak: slope of the prior's activation below zero.
-        corrected: correct the published slips: the prior adds to each frame its own position, and not that of frame 0;
+        corrected: correct the published slips: the prior adds to each frame its own position, and not frame 0's;
             it divides scores by the root of a head's width, and not of the whole layer's; and the second frame
-            follows a still face, and not the first frame's codes decoded alone, which is one constant face whatever the
-            speech is.
+            follows a still face, and not the first frame's codes decoded alone, which is one constant face for any
+            speech.
         history: which frames the predictor continues in training: the ``true`` ones as published, which lets it learn
             to continue motion without regard to the speech; or its ``own``, generated from a face that does not move,
             and then again from its own output, in one to three passes.
-        options: those of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
+        options: of the other methods with this decoder, see :class:`AutoregressiveModel`, and of every model.
     """
 
     network: Predictor
@@ -205,16 +205,17 @@ class CodeTalker(AutoregressiveModel):
                 f"--model.prior: is missing, and CodeTalker's predictor learns to speak a trained prior's codes; train "
                 f"one with --model.stage=prior ({RECIPE}) and give its checkpoint"
             )
-        try:
+        with damaged("--model.prior", "give a checkpoint of CodeTalker"):
             trained = load_model(path)
-        except FaceDiffError as error:
-            raise FaceDiffError(f"--model.prior {error}") from error
-        mine, theirs = self.prior_facts(), trained.prior_facts() if isinstance(trained, CodeTalker) else {}
-        if differing := [name for name in mine if mine[name] != theirs.get(name)]:
+        model_facts, trained_facts = (
+            self.prior_facts(),
+            trained.prior_facts() if isinstance(trained, CodeTalker) else {},
+        )
+        if differing := [name for name in model_facts if model_facts[name] != trained_facts.get(name)]:
             raise FaceDiffError(
                 f"--model.prior {path}: is of {type(trained).__name__} with {differing[0]} "
-                f"{theirs.get(differing[0])}, and this model has {mine[differing[0]]}; expected a checkpoint of "
-                f"CodeTalker's prior, trained with the same options"
+                f"{trained_facts.get(differing[0])}, and this model has {model_facts[differing[0]]}; "
+                f"expected a checkpoint of CodeTalker's prior, trained with the same options"
             )
         assert isinstance(trained, CodeTalker)  # noqa: S101 - else all options differ
         self.prior.load_state_dict(trained.prior.state_dict())
@@ -224,7 +225,7 @@ class CodeTalker(AutoregressiveModel):
         self._lacks_prior = False
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
         """The prior, which a file of the second stage may hold by itself, with its layers counted as here."""
         if inner := files.beginning("autoencoder."):
             for prefix in ("encoder.", "decoder.", "quantize."):
@@ -238,9 +239,9 @@ class CodeTalker(AutoregressiveModel):
             )
         for name in list(files.tensors):
             # The authors number attention (even) and feed-forward layers (odd) in one list.
-            if found := re.fullmatch(r"(\w+\.\w+_transformer\.net\.)(\d+)\.(.+)", name):
-                part = ("attention", "hidden")[int(found[2]) % 2]
-                files.tensors[f"{found[1]}{int(found[2]) // 2}.{part}.{found[3]}"] = files.tensors.pop(name)
+            if match := re.fullmatch(r"(\w+\.\w+_transformer\.net\.)(\d+)\.(.+)", name):
+                part = ("attention", "hidden")[int(match[2]) % 2]
+                files.tensors[f"{match[1]}{int(match[2]) // 2}.{part}.{match[3]}"] = files.tensors.pop(name)
         width = files.size("encoder.vertice_mapping.0.weight", 0)
         maps = "encoder.encoder_linear_embedding_post.net.weight"
         width = files.size(maps, 0) if maps in files.tensors else width
@@ -248,10 +249,10 @@ class CodeTalker(AutoregressiveModel):
 
     def prior_facts(self) -> dict[str, object]:
         """What two models must agree on to have the same prior, by the names of the options."""
-        own = {"n_vertices": self.n_vertices, "frame_rate": self.frame_rate, "motion_scale": self.motion_scaling}
+        facts = {"n_vertices": self.n_vertices, "frame_rate": self.frame_rate, "motion_scale": self.motion_scaling}
         sizes = {name: value for name, value in self.prior_options.items() if name not in ("dim", "num_layers")}
         return {
-            **own,
+            **facts,
             **sizes,
             "prior_dim": self.prior_options["dim"],
             "prior_layers": self.prior_options["num_layers"],
@@ -275,14 +276,14 @@ class CodeTalker(AutoregressiveModel):
         # The two halves of the VQ-VAE objective (van den Oord et al. 2017, eq. 3). Each stops the other's gradient:
         # without it a token and its code would run towards each other at one rate, and the table, which many clips
         # share, would follow single clips.
-        committed = masked_mean((codes.chosen.detach() - tokens).square(), frames)
-        moved = masked_mean((codes.chosen - tokens.detach()).square(), frames)
+        committed = masked_mean((codes.entries.detach() - tokens).square(), frames)
+        moved = masked_mean((codes.entries - tokens.detach()).square(), frames)
         quantisation = COMMITMENT * committed + moved
-        used = codes.numbers[frame_mask(frames, codes.numbers.shape[1])].flatten()
+        numbers = codes.numbers[frame_mask(frames, codes.numbers.shape[1])].flatten()
         return {
             "reconstruction": error,
             "quantisation": quantisation,
-            "perplexity": perplexity(used, len(self.prior.codebook)),
+            "perplexity": perplexity(numbers, len(self.prior.codebook)),
             "loss": error + quantisation,
         }
 
@@ -302,9 +303,9 @@ class CodeTalker(AutoregressiveModel):
                     before = self.motion_of(self.network.in_parallel(style, memory, before), frames)
         features = self.network.in_parallel(style, memory, before)
         with torch.no_grad():
-            # The target of the features is the code itself, not the token that it replaced: what is decoded later are
+            # The target of the features is the code itself, not the token that it replaced: later steps decode
             # codes.
-            true_codes = self.prior.quantise(self.prior.encode_clips(truth, frames)).chosen
+            true_codes = self.prior.quantise(self.prior.encode_clips(truth, frames)).entries
         error = mean_squared_error(self.motion_of(features, frames), truth, frames)
         distance = mean_squared_error(features, true_codes, frames)
         return {"reconstruction": error, "features": distance, "loss": error + distance}
@@ -325,19 +326,19 @@ class CodeTalker(AutoregressiveModel):
         values: list[Tensor] = []
         # The predictor's keys, values and codes of earlier frames stay as they are. The prior attends to all frames and
         # normalises over them, so its output for earlier ones changes with every frame: it decodes all codes again, but
-        # in its last layer and map the newest frame alone. The frames that are fed back are not those of the result.
-        for place in (progress or iter)(range(int(frames.max()))):
-            if place:
-                token = self.following(self.prior.decode_last(torch.cat(values, 1)), place - 1, style)
+        # in its last layer and map the newest frame alone. The frames that are fed back are not the result's.
+        for frame in (progress or iter)(range(int(frames.max()))):
+            if frame:
+                token = self.following(self.prior.decode_last(torch.cat(values, 1)), frame - 1, style)
             values.append(self.prior.quantise(self.network.out(state.step(token))).values)
         motion = self.prior.decode_clips(torch.cat(values, 1), frames)
         return self.offsets_of(motion)
 
-    def following(self, motion: Float[Tensor, "batch coordinates"], place: int, style: Tensor) -> Tensor:
-        """The token of the frame after ``place``."""
+    def following(self, motion: Float[Tensor, "batch coordinates"], frame: int, style: Tensor) -> Tensor:
+        """The token of the frame after ``frame``."""
         # The published code decodes the first frame twice over, since PyTorch's normalisation refuses a single frame.
         # Ours takes one; the result is the same.
-        if place == 0 and self.corrected:
+        if frame == 0 and self.corrected:
             motion = torch.zeros_like(motion)
         return (self.network.motion_in(motion) + style)[:, None]
 
@@ -397,11 +398,11 @@ class NoSpeech(AudioEncoder):
         super().__init__()
 
     def forward(self, audio: Waves, audio_lengths: Lengths, frame_lengths: Lengths) -> Frames:
-        """Refuse speech."""
-        raise FaceDiffError("CodeTalker's prior alone takes no speech; use the checkpoint of its predictor")
+        """No features."""
+        return audio.new_zeros(len(audio), int(frame_lengths.max()), 1)
 
 
-class Predictor(SpokenDecoder):
+class Predictor(SpeechDecoder):
     """Features of speech, a speaker's row and earlier motion to features of codes.
 
     Args:

@@ -5,7 +5,7 @@ Sun et al.: "DiffPoseTalk: Speech-Driven Stylistic 3D Facial Animation and Head 
 
 Diffusion over windows of FLAME's parameters, each of which continues the one before it; the style comes from a clip.
 From top to bottom: the model, training, sampling, streams, the authors' files. The network and the process stand in
-``diffposetalk_network.py``; docs/methods.md says what of the published code is an option.
+``diffposetalk_network.py``; docs/methods.md lists the options for choices of the published code.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from facediff.data import Batch
 from facediff.errors import ArgumentError, OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
-from facediff.models.layers import Heads, Layers, Share, Width
+from facediff.models.layers import Heads, Layers, Share, Width, check_heads
 from facediff.models.published.cards import AuthorFiles, Facts
 from facediff.models.published.clip_style import read_table, style_contrast
 from facediff.models.published.diffposetalk_network import (
@@ -75,7 +75,7 @@ class DiffPoseTalk(ParametricModel):
         guidance: how guided predictions are combined: ``incremental``, or ``independent``.
         audio_scale: scale of the guidance by speech.
         style_scale: scale of the guidance by style.
-        options: those of :class:`~facediff.models.published.parametric.ParametricModel`.
+        options: see :class:`~facediff.models.published.parametric.ParametricModel`.
 
     Attributes:
         threshold: clamp every prediction to this quantile of its magnitudes, itself between the second and the third
@@ -86,7 +86,7 @@ class DiffPoseTalk(ParametricModel):
     threshold: Threshold | None = None
     speech_context: bool = True
     samples: ClassVar[bool] = True
-    hears_whole_clips: ClassVar[bool] = False  # but windows that are cut anew in each step
+    encodes_whole_clips: ClassVar[bool] = False  # but windows that are cut anew in each step
     chosen: ClassVar[tuple[str, ...]] = (*ParametricModel.chosen, "scales", "guiding")
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="facebook/hubert-base-ls960", frozen_layers=2, edges=False
@@ -112,8 +112,7 @@ class DiffPoseTalk(ParametricModel):
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(shape_dim=shape_dim, head=head, **options)
-        if dim % num_heads or dim % 2:
-            raise ArgumentError({"dim": dim}, "it must be even, and a multiple of its attention heads")
+        check_heads(dim=dim, num_heads=num_heads, even=True)
         if context > window_frames:
             raise ArgumentError(
                 {"context": context, "window_frames": window_frames}, "a window must hold the context of the next"
@@ -149,12 +148,12 @@ class DiffPoseTalk(ParametricModel):
         return faces_of(files, options)
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Sizes, statistics, and what the files say that their networks were trained with."""
-        said, style_dim = files.arguments.get("start_motion_feat", {}), files.size("null_style_feat", 2)
-        if str(said.get("target", "sample")) != "sample" or str(said.get("pad_mode", "zero")) != "zero":
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
+        """Sizes, statistics, and options of training from the files."""
+        stated, style_dim = files.arguments.get("start_motion_feat", {}), files.size("null_style_feat", 2)
+        if str(stated.get("target", "sample")) != "sample" or str(stated.get("pad_mode", "zero")) != "zero":
             raise OptionError.naming(
-                f"{files.source}: predicts {said.get('target')} from speech filled up by {said.get('pad_mode')}; "
+                f"{files.source}: predicts {stated.get('target')} from speech filled up by {stated.get('pad_mode')}; "
                 f"expected a model of clean motion (sample, zero)"
             )
         first = next((name for name in files.tensors if name.endswith("motion_proj.weight")), "")
@@ -167,14 +166,14 @@ class DiffPoseTalk(ParametricModel):
             "head": files.size("start_motion_feat", 2) >= 54,
             "shape_dim": files.size("denoising_net.person_proj.weight", 1) - style_dim,
         }
-        for theirs, ours, where in (
-            ("n_heads", "num_heads", said),
+        for author_name, option, where in (
+            ("n_heads", "num_heads", stated),
             ("n_heads", "style_heads", files.arguments.get(first, {})),
-            ("cfg_mode", "guidance", said),
+            ("cfg_mode", "guidance", stated),
         ):
-            if where.get(theirs) is not None:
-                options[ours] = where[theirs]
-        if isinstance(guiding := said.get("guiding_conditions"), str):
+            if where.get(author_name) is not None:
+                options[option] = where[author_name]
+        if isinstance(guiding := stated.get("guiding_conditions"), str):
             options["conditions"] = [name for name in ("audio", "style") if name in guiding.split(",")]
         files.tensors |= facts.details
         return options
@@ -218,32 +217,34 @@ class DiffPoseTalk(ParametricModel):
         """Errors of the predicted clean motion of two windows, the second of which continues the first."""
         motion = self.standardised(batch.motion)
         size, frames = self.window_frames, batch.frame_lengths
-        usual = self.encode_style(batch.reference, batch.reference_mask)
-        own: Tensor = self.style_encoder(motion, batch.mask)
-        terms = {"style": style_contrast(usual, own)}
-        features = self.hear(batch, frames)
+        style_vector = self.encode_style(batch.reference, batch.reference_mask)
+        motion_style: Tensor = self.style_encoder(motion, batch.mask)
+        terms = {"style": style_contrast(style_vector, motion_style)}
+        features = self.encode_speech(batch, frames)
         first = self._randint(max(1, int(frames.max()) - size + 1), len(batch), generator) % frames.clamp_min(1)
         unheard, unknown = self.dropped(len(batch), generator)
-        person = torch.where(unknown[:, None], self.no_style[0], usual.detach())
+        person = torch.where(unknown[:, None], self.no_style[0], style_vector.detach())
         person = torch.cat([self.shapes_of(batch), person], 1)
         before = (self.start_motion.expand(len(batch), -1, -1), self.start_audio.expand(len(batch), -1, -1))
         errors: list[dict[str, Tensor]] = []
         for number in range(2):
             clean, valid = window_at(motion, frames, first, size)
-            heard, _ = window_at(features, frames, first, size)
+            speech, _ = window_at(features, frames, first, size)
             if number and not bool(valid.any()):
                 break
-            silent = torch.where(unheard[:, None, None], self.no_audio, heard)
+            silent = torch.where(unheard[:, None, None], self.no_audio, speech)
             step = self._randint(self.process.steps, len(batch), generator)
             noise = torch.randn(clean.shape, device=self.device, generator=generator)
             noisy = self.process.add_noise(clean, noise, step)
             predicted = self.network(noisy, silent, person, before, step + 1, valid.to(clean))
             # The frames before a window are predicted too; those before the first one have no truth.
-            known = torch.cat([before[0], clean], 1) if number else clean
-            counted = F.pad(valid, (self.context, 0), value=True) if number else valid
-            counted = counted & valid[:, :1]
-            errors.append(self._errors(predicted[:, predicted.shape[1] - known.shape[1] :], known, counted))
-            before, first = (clean[:, -self.context :], heard[:, -self.context :]), first + size
+            past_and_clean = torch.cat([before[0], clean], 1) if number else clean
+            loss_mask = F.pad(valid, (self.context, 0), value=True) if number else valid
+            loss_mask = loss_mask & valid[:, :1]
+            errors.append(
+                self._errors(predicted[:, predicted.shape[1] - past_and_clean.shape[1] :], past_and_clean, loss_mask)
+            )
+            before, first = (clean[:, -self.context :], speech[:, -self.context :]), first + size
         terms |= {name: torch.stack([error[name] for error in errors]).mean() for name in errors[0]}
         terms["loss"] = terms["reconstruction"] + sum(
             (weight * terms[name] for name, weight in WEIGHTS.items()), start=torch.zeros((), device=self.device)
@@ -256,11 +257,11 @@ class DiffPoseTalk(ParametricModel):
         As the authors do: for incremental guidance by both, style from 45 % and speech from 10 % of them, among these;
         for independent guidance half of either; for guidance by one condition, 10 %.
         """
-        drop, both = torch.rand(count, device=self.device, generator=generator), len(self.guiding) == 2
-        if both and self.guidance == "incremental":
+        drop, two_conditions = torch.rand(count, device=self.device, generator=generator), len(self.guiding) == 2
+        if two_conditions and self.guidance == "incremental":
             return drop > 0.9, drop > 0.55
-        share, other = 0.5 if both else 0.1, torch.rand(count, device=self.device, generator=generator)
-        return drop < share * ("audio" in self.guiding), other < share * ("style" in self.guiding)
+        share, second_draw = 0.5 if two_conditions else 0.1, torch.rand(count, device=self.device, generator=generator)
+        return drop < share * ("audio" in self.guiding), second_draw < share * ("style" in self.guiding)
 
     def _randint(self, bound: int, count: int, generator: torch.Generator | None) -> Int[Tensor, " batch"]:
         return torch.randint(0, bound, (count,), device=self.device, generator=generator)
@@ -285,10 +286,10 @@ class DiffPoseTalk(ParametricModel):
 
     # Speech.
 
-    def hear(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames dim"]:
+    def encode_speech(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames dim"]:
         """Speech of each clip's frames."""
         rows = [
-            self.hear_wave(self.standard_speech(batch.audio[i, : int(batch.audio_lengths[i])]), int(frames[i]))
+            self.encode_wave(self.standard_speech(batch.audio[i, : int(batch.audio_lengths[i])]), int(frames[i]))
             for i in range(len(batch))
         ]
         return nn.utils.rnn.pad_sequence(rows, batch_first=True)
@@ -298,11 +299,11 @@ class DiffPoseTalk(ParametricModel):
         """(x − mean)/(s + 1e-5) with the unbiased deviation s of the whole file, which is 0 of one sample."""
         return (audio - audio.mean()) / (audio.std(correction=min(1, len(audio) - 1)) + 1e-5)
 
-    def hear_wave(self, wave: Float[Tensor, " samples"], frames: int) -> Float[Tensor, "frames dim"]:
+    def encode_wave(self, wave: Float[Tensor, " samples"], frames: int) -> Float[Tensor, "frames dim"]:
         """Speech of so many frames that ``wave``, standardised already, lasts for."""
         encoder = self.audio_encoder
         if isinstance(encoder, Wav2Vec2Encoder):
-            hidden = encoder.hidden_of(fitted(wave)[None], 2 * frames, most=4 * frames)
+            hidden = encoder.hidden_of(fitted(wave)[None], 2 * frames, max_steps=4 * frames)
             hidden = F.interpolate(hidden.transpose(1, 2), size=frames, mode="linear").transpose(1, 2)
         else:
             lengths = torch.tensor([len(wave)], device=wave.device)
@@ -330,7 +331,7 @@ class DiffPoseTalk(ParametricModel):
         return F.pad(motion, (0, 0, 0, 0, 0, max(0, int(frames.max()) - motion.shape[1])))[:, : int(frames.max())]
 
     def noise_of(self, seed: int) -> SeededNoise:
-        """The noise of a seed, whatever the clip."""
+        """The noise of a seed, the same for every clip."""
         return SeededNoise([self.window_frames], [seed], self.device)
 
     @property
@@ -347,12 +348,12 @@ class DiffPoseTalk(ParametricModel):
     def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> SpeechStream:  # noqa: ANN401
         """Animate speech of any length while it arrives, in the method's own windows; see the base class.
 
-        Where other windows were chosen, such as those of low latency, speech is cut into these.
+        Where other windows were chosen, such as low latency's, speech is cut into these.
         """
-        whole = super().stream(plan=plan, **choices)
+        stream = super().stream(plan=plan, **choices)
         if not math.isinf((plan or self.windows).above):
-            return whole
-        return WindowStream(self, whole.clip, seeds=whole.seeds, plan=plan)
+            return stream
+        return WindowStream(self, stream.clip, seeds=stream.seeds, plan=plan)
 
     def sample(
         self,
@@ -378,31 +379,31 @@ class DiffPoseTalk(ParametricModel):
         size, unit = self.window_frames, SAMPLE_RATE / self.frame_rate
         audio = self.standard_speech(audio)
         windows = max(1, math.ceil(self.frames_of(len(audio)) / size))
-        missing = self.window_samples * windows - len(audio)
-        if missing > 0:
-            audio = F.pad(audio, (0, missing))
-        filled = max(0, math.ceil(missing / unit))
-        features = self.hear_wave(audio, size * windows) if self.speech_context else None
+        padding = self.window_samples * windows - len(audio)
+        if padding > 0:
+            audio = F.pad(audio, (0, padding))
+        filled = max(0, math.ceil(padding / unit))
+        features = self.encode_wave(audio, size * windows) if self.speech_context else None
         start = draw(audio.new_empty(1, size, len(self.modelled)))
         before: tuple[Tensor, Tensor] = (self.start_motion, self.start_audio)
         parts = []
         for number in progress(range(windows)) if progress is not None else range(windows):
             first = number * size
             if features is None:
-                heard = self.hear_wave(audio[round(first * unit) : round((first + size) * unit)], size)
+                speech = self.encode_wave(audio[round(first * unit) : round((first + size) * unit)], size)
             else:
-                heard = features[first : first + size]
+                speech = features[first : first + size]
             real = audio.new_ones(1, size)
             if number == windows - 1 and filled:
                 real[:, size - min(size, filled) :] = 0
-            motion = self.sample_window(heard[None], shape, style, before, start, real, draw)
-            before = (motion[:, -self.context :], heard[None, -self.context :])
+            motion = self.sample_window(speech[None], shape, style, before, start, real, draw)
+            before = (motion[:, -self.context :], speech[None, -self.context :])
             parts.append(motion[0])
         return torch.cat(parts)[: size * windows - filled]
 
     def sample_window(
         self,
-        heard: Float[Tensor, "1 window dim"],
+        speech: Float[Tensor, "1 window dim"],
         shape: Float[Tensor, "1 shape_dim"],
         style: Float[Tensor, "1 style_dim"] | None,
         before: tuple[Tensor, Tensor],
@@ -412,15 +413,15 @@ class DiffPoseTalk(ParametricModel):
     ) -> Float[Tensor, "1 window channels"]:
         """The reverse process of one window, guided by those conditions that :attr:`guiding` names."""
         style = self.no_style[0] if style is None else style
-        silent = self.no_audio.expand_as(heard) if "audio" in self.guiding else heard
-        nobody = self.no_style[0] if "style" in self.guiding else style
+        silent = self.no_audio.expand_as(speech) if "audio" in self.guiding else speech
+        neutral = self.no_style[0] if "style" in self.guiding else style
         # Without any condition first, then one more in each branch; or, independently, each one by itself.
-        speech, styles = [silent], [nobody]
+        conditions, styles = [silent], [neutral]
         for name in self.guiding:
-            speech.append(silent if name == "style" and self.guidance == "independent" else heard)
-            styles.append(style if name == "style" else nobody)
-        count = len(speech)
-        audio = torch.cat(speech)
+            conditions.append(silent if name == "style" and self.guidance == "independent" else speech)
+            styles.append(style if name == "style" else neutral)
+        count = len(conditions)
+        audio = torch.cat(conditions)
         person = torch.cat([torch.cat([shape, one], 1) for one in styles])
         wide = (before[0].expand(count, -1, -1), before[1].expand(count, -1, -1))
         scales = [self.scales[name] for name in self.guiding]
@@ -474,45 +475,45 @@ class WindowStream(PieceStream):
 
     @torch.inference_mode()
     def finish(self, frames: int | None = None) -> Motion:
-        """Give the motion that is left; arguments and errors are those of the base class."""
+        """Give the motion that is left; arguments and errors as in the base class."""
         self._refuse_finished()
         self._finished = True
         # By rounding, all of the speech may last a frame less than its windows.
         left = max(0, self.model.frames_of(self._sums[0] + len(self._wave)) - self.frames)
-        wanted = self._left(self.frames + left, frames)
-        motion = self._counted([self._next(self._wave, left)[:, :wanted]] if left else [])
-        return F.pad(motion, (0, 0, 0, 0, 0, wanted - motion.shape[1]))
+        count = self._left(self.frames + left, frames)
+        motion = self._counted([self._next(self._wave, left)[:, :count]] if left else [])
+        return F.pad(motion, (0, 0, 0, 0, 0, count - motion.shape[1]))
 
     def _next(self, wave: Float[Tensor, " samples"], frames: int) -> Motion:
         """The motion of the next window, of which so many frames are of speech."""
         model, (count, total, squares) = self.model, self._sums
         numbers = wave.double()
-        # The authors bring a whole recording to one level; of a stream, that of all that was heard so far is known.
+        # The authors bring a whole recording to one level; of a stream only the level of the speech so far is known.
         self._sums = (count + len(wave), total + float(numbers.sum()), squares + float(numbers.square().sum()))
         mean, deviation = level_of(*self._sums)
         wave = F.pad((wave - mean) / deviation, (0, model.window_samples - len(wave)))
-        heard = model.hear_wave(wave, model.window_frames)[None]
-        wanted = wave.new_ones(1, model.window_frames)
-        wanted[:, frames:] = 0
+        speech = model.encode_wave(wave, model.window_frames)[None]
+        mask = wave.new_ones(1, model.window_frames)
+        mask[:, frames:] = 0
         motions = []
         for number, (draw, start) in enumerate(zip(self._draws, self._starts, strict=True)):
             before = self._before[number]
-            motion = model.sample_window(heard, self._shape, self._style, before, start, wanted, draw)
-            self._before[number] = (motion[:, -model.context :], heard[:, -model.context :])
+            motion = model.sample_window(speech, self._shape, self._style, before, start, mask, draw)
+            self._before[number] = (motion[:, -model.context :], speech[:, -model.context :])
             motions.append(model.absolute(motion[0, :frames]))
         return torch.stack(motions)
 
 
 def level_of(count: int, total: float, squares: float) -> tuple[float, float]:
-    """What speech is standardised by, of its samples, their sum and that of their squares: mean, deviation + 1e-5."""
+    """Mean of speech and its deviation + 1e-5, from the number of samples, their sum and the sum of their squares."""
     mean = total / count
     return mean, math.sqrt(max(0.0, squares - count * mean**2) / max(1, count - 1)) + 1e-5
 
 
 def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:
     """Speech with its ends mirrored, so that HuBERT gives exactly 50 steps a second: 320·n + 80 samples."""
-    missing = 320 * max(1, len(wave) // 320) + 80 - len(wave)
-    side = math.ceil(missing / 2)
+    padding = 320 * max(1, len(wave) // 320) + 80 - len(wave)
+    side = math.ceil(padding / 2)
     if side < 0:
         return wave
     padded = wave[None]
@@ -529,9 +530,9 @@ STATISTICS = tuple(f"{key}_{name}" for key in ("exp", "pose", "shape") for name 
 
 
 def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
-    """One speaker, or those whose shapes are given, and the statistics by which shapes and motion are standardised."""
+    """One speaker, or the speakers of the given shapes, and the statistics that standardise shapes and motion."""
     count = files.size("denoising_net.person_proj.weight", 1) - files.size("null_style_feat", 2)
-    statistics, given = options.statistics, options.templates
+    statistics, templates = options.statistics, options.templates
     if statistics is None:
         raise OptionError.naming(
             f"{{statistics}}: {files.source} lacks the statistics of its training motion; give its authors' "
@@ -541,12 +542,12 @@ def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
         statistics = read_arrays(Path(statistics), STATISTICS, remedy="expected stats_train.npz of DiffPoseTalk")
     motion, deviation = statistics_of(statistics, ("exp", "pose"))
     mean_shape, shape_deviation = statistics_of(statistics, ("shape",))
-    if given is None:
+    if templates is None:
         shapes: dict[str, Any] = {"speaker": np.zeros(count)}
-    elif isinstance(given, Mapping):
-        shapes = dict(given)
+    elif isinstance(templates, Mapping):
+        shapes = dict(templates)
     else:
-        path = Path(given)
+        path = Path(templates)
         shapes = {path.stem: open_array(path) if path.suffix == ".npy" else read_arrays(path, ("shape",))["shape"]}
     rows = {str(name): np.asarray(value, np.float32).reshape(-1)[:count] for name, value in shapes.items()}
     if len(motion) != 56 or len(mean_shape) != count or any(len(row) != count for row in rows.values()):

@@ -112,16 +112,10 @@ class CosineProcess(NoiseProcess):
 
 
 def guided(branches: Sequence[Tensor], scales: Sequence[float], guidance: Guidance) -> Tensor:
-    """Predictions without and with conditions as one.
-
-    Args:
-        branches: without any condition, then one for each condition in turn.
-        scales: one for each condition.
-        guidance: see :data:`Guidance`.
-    """
+    """Predictions without and with conditions as one."""
     result = branches[0]
     for number, scale in enumerate(scales):
-        # Published: independent guidance takes its second difference from what the first one gave, since it adds to the
+        # Published: independent guidance takes its second difference from the first one's result, since it adds to the
         # prediction it compares with.
         reference = branches[number] if guidance == "incremental" else result
         result = result + scale * (branches[number + 1] - reference)

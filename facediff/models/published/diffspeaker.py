@@ -1,8 +1,8 @@
 """DiffSpeaker (Ma et al.: "DiffSpeaker: Speech-Driven 3D Facial Animation with Diffusion Transformer", 2024).
 
 Diffusion over offsets from the template, with one Transformer layer in which the speaker and the denoising step are
-tokens that every frame attends to. From top to bottom: the model, its network, the sampler's steps, the authors'
-checkpoints. docs/methods.md says what of the published code is an option here.
+tokens that every frame attends to. From top to bottom: the model, its sampler, its network, its graphs.
+docs/methods.md says which choices of the published code are options here.
 """
 
 from __future__ import annotations
@@ -20,32 +20,16 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, OptionError, choices
+from facediff.errors import OptionError, choices
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
-from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
-from facediff.models.graphs import (
-    BATCH,
-    FRAMES,
-    Graph,
-    Graphs,
-    ModelPart,
-    SamplingLoop,
-    Spoken,
-    results_of,
-    update_table,
-)
+from facediff.models.folding import Fold, SamplingSpace, WeightCache
+from facediff.models.graphs import Graphs, ModelPart, SpeechInput
 from facediff.models.inference import BatchMotion, Progress
-from facediff.models.layers import Heads, Layers, Share, Width, frame_mask
-from facediff.models.published.autoregressive import Period, ProjectedKeysValues, SpokenLayer
-from facediff.models.published.base import TRAINED_NETWORK, LongSpeech, SpeakerTable, still_map, whole_model, zeros
-from facediff.models.published.diffusion import (
-    CONDITIONS,
-    DiffusionModel,
-    conditions_of,
-    features_graph,
-    space_of,
-)
+from facediff.models.layers import AttentionContext, Heads, Layers, Share, Width, check_heads, frame_mask
+from facediff.models.published.autoregressive import Period, SpeechDecoderLayer
+from facediff.models.published.base import TRAINED_NETWORK, LongSpeech, SpeakerTable, still_map
+from facediff.models.published.diffusion import DiffusionModel, diffusion_graphs
 from facediff.models.published.positions import periodic_positions
 from facediff.models.samplers import NoiseProcess, NoiseSource, Sampler
 from facediff.models.squared_errors import squared_errors
@@ -53,7 +37,7 @@ from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 
 Scheduler = Literal["published", "ddim"]
-"""The published scheduler's update of DDIM, or that of the paper."""
+"""The published scheduler's update of DDIM, or the paper's."""
 
 TRAINING_STEPS = 1000
 """Noising steps of the process that the sampler's steps are taken from."""
@@ -69,24 +53,26 @@ class DiffSpeaker(DiffusionModel):
         num_heads: its attention heads.
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
         dropout: in the Transformer and on its positions, in training.
-        period: frames after which positions and the attention's bias repeat; those of a second if None.
+        period: frames after which positions and the attention's bias repeat; one second if None.
         scheduler: ``published`` is DDIM as diffusers 0.11 had it, which takes the predicted clean motion for the
             predicted noise where it goes to the next step; ``ddim`` computes that noise, as the paper of DDIM does.
         sampling_steps: denoising steps, at most 1000.
         sampling_space: where sampling runs: ``folded`` into the first map's width, or on the ``vertices``, as
-            published; nothing but rounding differs.
+            published; only rounding differs.
         smooth: take the mean of each frame, the one before and the one after it; at 30 frames a second (VOCASET) if
             None, as published.
-        long_speech: what is done with more than 3000 frames, for which the published tables have no rows: ``refuse``
+        long_speech: for more than 3000 frames the published tables have no rows: ``refuse``
             them, as published; animate ``windows`` of them; or ``extend`` the tables by their formula.
         weight_decay: AdamW's, as PyTorch has it.
-        options: those of :class:`DiffusionModel`, and of every model.
+        options: as of :class:`DiffusionModel`, and of every model.
     """
 
     chosen: ClassVar[tuple[str, ...]] = (*DiffusionModel.chosen, "scheduler", "sampling_steps")
     samplers: ClassVar[tuple[str, ...]] = ("ddim",)
     table_frames: ClassVar[int | None] = 3000
     interpolates: ClassVar[bool] = True
+    network: DiffSpeakerNetwork
+    fresh_noise: ClassVar[bool] = False
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         TRAINED_NETWORK, source="facebook/hubert-base-ls960", epsilon=1e-7
     )
@@ -110,8 +96,7 @@ class DiffSpeaker(DiffusionModel):
     ) -> None:
         super().__init__(weight_decay=weight_decay, **options)
         self.dim = dim or (1024 if self.frame_rate == 25.0 else 512)
-        if self.dim % num_heads or self.dim % 2:
-            raise ArgumentError({"dim": self.dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
+        check_heads(dim=self.dim, num_heads=num_heads, even=True)
         self.scheduler: Scheduler = scheduler
         self.sampling_steps = sampling_steps
         self.sampling_space: SamplingSpace = sampling_space
@@ -144,10 +129,9 @@ class DiffSpeaker(DiffusionModel):
             raise OptionError.naming(
                 f"{{sampler}} {name}: DiffSpeaker has no such sampler: {choices(name, self.samplers)}"
             )
-        if steps is not None and not 1 <= steps <= TRAINING_STEPS:
-            raise OptionError.naming(f"{{steps}} {steps}: expected a number from 1 to {TRAINING_STEPS}")
         self.scheduler = "ddim" if name == "ddim" else self.scheduler
-        self.sampling_steps = steps or self.sampling_steps
+        self.sampling_steps = self.sampling_steps if steps is None else steps
+        _ = self.sampler  # refuses a number of steps that the process has not
 
     # Frames, speech and the speaker.
 
@@ -164,21 +148,20 @@ class DiffSpeaker(DiffusionModel):
         """Of identity 0, which the published test takes for a subject that was not trained on."""
         return torch.eye(len(self.identities))[0]
 
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states, interpolated to the frames."""
-        cached = heard.cached_features or ()
-        return self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "hidden", *cached)
+        return self.speech_features(speech, frames, "hidden")
 
     def conditions(self, batch: Batch, frames: Int[Tensor, " batch"]) -> SpeakerConditions:
-        """What the network is conditioned on in every step."""
+        """The conditions of every step."""
         valid = frame_mask(frames, int(frames.max())) if bool((frames != frames.max()).any()) else None
-        heard = self.network.audio_map(self.hear(batch, frames))
-        return self.network.conditions(heard, self.identity_weights(batch), valid)
+        speech = self.network.audio_map(self.encode_speech(batch, frames))
+        return self.network.conditions(speech, self.identity_weights(batch), valid)
 
     # Training.
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """The mean squared error of the predicted clean motion at a random step, and that of its first differences."""
+        """The mean squared error of the predicted clean motion at a random step, and of its first differences."""
         step = torch.randint(0, TRAINING_STEPS, (len(batch),), device=self.device, generator=generator)
         noise = torch.randn(batch.motion.flatten(2).shape, device=self.device, generator=generator)
         return self.losses_at(batch, step, noise)
@@ -204,14 +187,19 @@ class DiffSpeaker(DiffusionModel):
 
     # Sampling.
 
-    def state_space(self) -> VertexSpace | FoldedSpace:
-        """Where the reverse process runs."""
-        rest = self.network.motion_out.bias.new_zeros(1, 1, self.coordinates)
-        return space_of(self.network, self.sampling_space, rest, fresh_noise=False)
-
     def graphs(self) -> Graphs:
-        """Speech, one step of the reverse process, the last map with the smoothing."""
-        return diffspeaker_graphs(self)
+        """The present scheduler, and the last map with the smoothing; noise is drawn once, on the vertices."""
+        folded = self.sampling_space == "folded"
+        return diffusion_graphs(
+            self,
+            SpeakerStep(self),
+            SpeakerMotion(self),
+            f"{self.scheduler} DDIM" if self.scheduler == "published" else "ddim",
+            drawn=self.coordinates,
+            state=2 * self.dim + 2 if folded else self.coordinates,
+            starts=folded,
+            last_noise=folded and not self.sampler.literal,
+        )
 
     @property
     def sampler(self) -> SpeakerSampler:
@@ -224,22 +212,22 @@ class DiffSpeaker(DiffusionModel):
         """The reverse process from noise that is drawn once."""
         self.check_length(frames, batch.names)
         conditions = self.conditions(batch, frames)
-        drawn = noise(batch.template.new_empty(len(batch), int(frames.max()), self.coordinates))
+        initial_noise = noise(batch.template.new_empty(len(batch), int(frames.max()), self.coordinates))
 
         def denoise(state: Tensor, step: int) -> Tensor:
             return self.predict(state, torch.full((len(batch),), step, device=state.device), conditions)[0]
 
-        state = self.sampler.run(denoise, self.first_state(drawn), progress=progress)
-        motion = self.motion_of(state, drawn)
+        state = self.sampler.run(denoise, self.first_state(initial_noise), progress=progress)
+        motion = self.motion_of(state, initial_noise)
         return smoothed(motion, frames) if self.smooth else motion
 
-    # In the folded space, noisy motion is a sum of maps of what the network gave, of a bias and of the first noise,
+    # In the folded space, noisy motion is a sum of maps of the network's features, of a bias and of the first noise,
     # each with a factor that the sampler makes, so that the vertices are not needed before the end. A frame of the
     # state is: noisy motion as the network sees it, the sum of the network's features, the bias's factor, the first
     # noise's factor.
 
     def first_state(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
-        """Noise alone: of features and bias there is nothing yet."""
+        """Noise alone, without features and bias."""
         state = self.state_space().project(noise)
         if self.sampling_space == "vertices":
             return state
@@ -258,7 +246,7 @@ class DiffSpeaker(DiffusionModel):
         return torch.cat([space.clean(hidden), hidden, ones, torch.zeros_like(ones)], -1), hidden
 
     def motion_of(self, state: Float[Tensor, "batch frames state"], noise: Tensor | None) -> BatchMotion:
-        """Offsets at the end of sampling; ``noise`` is what it started from, if anything is left of it."""
+        """Offsets at the end of sampling; ``noise`` is the unit noise of the start, if anything is left of it."""
         if self.sampling_space == "folded":
             features, last = state[..., self.dim : -2], self.network.motion_out
             coordinates = F.linear(features, last.weight) + state[..., -2:-1] * last.bias
@@ -284,16 +272,16 @@ class SpeakerSampler(Sampler):
     def __init__(self, process: NoiseProcess, steps: int, *, literal: bool) -> None:
         super().__init__(process, steps)
         self.stride, self.literal = process.steps // steps, literal
-        self.timesteps = [min(place * self.stride + 1, process.steps - 1) for place in reversed(range(steps))]
+        self.timesteps = [min(number * self.stride + 1, process.steps - 1) for number in reversed(range(steps))]
 
     def update(self, i: int, noisy: Tensor, predictions: Sequence[Tensor], noise: NoiseSource) -> Tensor:
         """One step; nothing is drawn."""
         step, signal = self.timesteps[i], self.process.signal
-        now, after = float(signal[step]), float(signal[max(step - self.stride, 0)])
+        signal_now, signal_after = float(signal[step]), float(signal[max(step - self.stride, 0)])
         if self.literal:
-            return (math.sqrt(after) + math.sqrt(1 - after)) * predictions[-1]
-        of_noisy = math.sqrt(1 - after) / math.sqrt(1 - now)
-        return (math.sqrt(after) - of_noisy * math.sqrt(now)) * predictions[-1] + of_noisy * noisy
+            return (math.sqrt(signal_after) + math.sqrt(1 - signal_after)) * predictions[-1]
+        of_noisy = math.sqrt(1 - signal_after) / math.sqrt(1 - signal_now)
+        return (math.sqrt(signal_after) - of_noisy * math.sqrt(signal_now)) * predictions[-1] + of_noisy * noisy
 
 
 def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
@@ -308,7 +296,7 @@ def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
 
 @dataclass(frozen=True, eq=False)
 class SpeakerConditions:
-    """What a clip's motion is conditioned on, and what is constant over the denoising steps.
+    """The conditions of a clip's motion, and other constants of the denoising steps.
 
     Attributes:
         style: the speaker's tokens of all layers, side by side.
@@ -318,47 +306,40 @@ class SpeakerConditions:
     """
 
     style: Tensor
-    speech: list[ProjectedKeysValues]
+    speech: list[AttentionContext]
     positions: Tensor
     bias: Float[Tensor, "... frames keys"]
 
 
-class AdaptedLayer(SpokenLayer):
+class AdaptedLayer(SpeechDecoderLayer):
     """Each part is of the normalised frames and added to them.
 
-    Frames attend to two further tokens in both attentions, that of the speaker and that of the step.
+    Frames attend to two further tokens in both attentions, one of the speaker and one of the step.
     """
 
     def forward(
         self,
         x: Float[Tensor, "batch frames dim"],
         tokens: Float[Tensor, "batch 2 dim"],
-        speech: ProjectedKeysValues,
+        speech: AttentionContext,
         bias: Tensor,
     ) -> Float[Tensor, "batch frames dim"]:
-        """Frames after the layer.
-
-        Args:
-            x: the frames.
-            tokens: the speaker and the step, which are not normalised.
-            speech: keys and values of the frames' own moments of the speech.
-            bias: added to the scores of the tokens and the frames.
-        """
+        """Frames after the layer."""
         # Pre-norm with GELU, unlike FaceFormer's layer. The two tokens join keys and values as they are, before any
         # norm, and get no query: nothing reads a result of theirs.
-        normed, own = self.norms[0](x), self.self_attention
-        frames = ProjectedKeysValues(*map(joined, own.keys_values(tokens), own.keys_values(normed)))
+        normed, attention = self.norms[0](x), self.self_attention
+        frames = AttentionContext(*map(joined, attention.keys_values(tokens), attention.keys_values(normed)))
         # Normalised before each part, and not after it as in FaceFormer's decoder.
-        x = x + self.dropout(own.attend(own.queries(normed), frames, bias))
-        heard, count = self.cross_attention, x.shape[1]
+        x = x + self.dropout(attention.attend(attention.queries(normed), frames, bias))
+        cross, count = self.cross_attention, x.shape[1]
         # Each frame has the two tokens and one moment of speech to attend to, side by side.
-        moments = ProjectedKeysValues(
+        moments = AttentionContext(
             *(
                 torch.cat([token[:, :, None].expand(-1, -1, count, -1, -1), part[:, :, :, None]], 3).flatten(2, 3)
-                for token, part in zip(heard.keys_values(tokens), speech, strict=True)
+                for token, part in zip(cross.keys_values(tokens), speech, strict=True)
             )
         )
-        x = x + self.dropout(heard.attend_own(heard.queries(self.norms[1](x)), moments))
+        x = x + self.dropout(cross.attend_own(cross.queries(self.norms[1](x)), moments))
         return x + self.dropout(self.second(self.dropout(F.gelu(self.first(self.norms[2](x))))))
 
 
@@ -407,13 +388,7 @@ class DiffSpeakerNetwork(nn.Module):
         identities: Float[Tensor, "batch identities"],
         valid: Bool[Tensor, "batch frames"] | None,
     ) -> SpeakerConditions:
-        """What is constant over the denoising steps.
-
-        Args:
-            memory: the speech after ``audio_map``.
-            identities: weights of the training identities.
-            valid: True on valid frames; all are if None.
-        """
+        """Constants of the denoising steps."""
         frames = memory.shape[1]
         speech = [layer.cross_attention.keys_values(memory) for layer in self.layers]  # type: ignore[union-attr, operator]
         positions = periodic_positions(frames, self.dim, self.period, device=memory.device)
@@ -426,7 +401,7 @@ class DiffSpeakerNetwork(nn.Module):
     def forward(
         self, mapped: Float[Tensor, "batch frames dim"], step: Int[Tensor, " batch"], conditions: SpeakerConditions
     ) -> Float[Tensor, "batch frames dim"]:
-        """From noisy motion after ``motion_in`` to what ``motion_out`` makes clean motion of."""
+        """From noisy motion after ``motion_in`` to the features that ``motion_out`` maps to clean motion."""
         x = self.dropout(mapped + conditions.positions)
         time = self.time(step_sinusoids(step, self.time_dim))
         tokens = torch.stack([part.unflatten(1, (-1, self.dim)) for part in (conditions.style.to(time), time)], 2)
@@ -449,10 +424,10 @@ def mutual_bias(
 ) -> Float[Tensor, "heads frames frames"]:
     """−2^(−8(h+1)/heads)·⌊(i − j)/period⌋ for head h, frame i and j ≤ i, and of ⌊(j − i − 1)/period⌋ for j > i.
 
-    The published table is that of later frames turned about, so that both sides differ by one frame.
+    The published table is the later frames' turned about, so that both sides differ by one frame.
     """
-    places = torch.arange(frames, device=device)
-    distance = places[:, None] - places
+    frames_range = torch.arange(frames, device=device)
+    distance = frames_range[:, None] - frames_range
     # The authors flip a causal table to make the other half, which leaves later frames one nearer than earlier ones.
     distance = torch.where(distance < 0, -distance - 1, distance)
     slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
@@ -477,14 +452,6 @@ class SpeakerStep(ModelPart[DiffSpeaker]):
         return self.model.predict(state, step, conditions)
 
 
-class SpeakerStart(ModelPart[DiffSpeaker]):
-    """Unit noise on the vertices to the folded state that sampling starts from."""
-
-    def forward(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
-        """The first state."""
-        return self.model.first_state(noise)
-
-
 class SpeakerMotion(ModelPart[DiffSpeaker]):
     """The end of sampling to offsets from the template, smoothed where the model does so."""
 
@@ -501,46 +468,7 @@ class SpeakerMotion(ModelPart[DiffSpeaker]):
 def smoothed_whole(motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames points dims"]:
     """As :func:`smoothed`, of clips without padding and of any length."""
     # By indices and not by slices: a graph takes clips of any length, and slices of one or two frames would be empty.
-    places, last = torch.arange(motion.shape[1]), motion.shape[1] - 1
-    before, after = motion[:, (places - 1).clamp_min(0)], motion[:, (places + 1).clamp_max(last)]
-    inner = ((places > 0) & (places < last))[:, None, None]
+    indices, last = torch.arange(motion.shape[1]), motion.shape[1] - 1
+    before, after = motion[:, (indices - 1).clamp_min(0)], motion[:, (indices + 1).clamp_max(last)]
+    inner = ((indices > 0) & (indices < last))[:, None, None]
     return torch.where(inner, (before + motion + after) / 3, motion)
-
-
-def diffspeaker_graphs(model: DiffSpeaker) -> Graphs:
-    """DiffSpeaker with its present scheduler; its noise is drawn once, on the vertices."""
-    speech = features_graph(model, model.network, 1)
-    features = results_of(speech)
-    batch, frames, dim = features.shape
-    folded, coordinates = model.sampling_space == "folded", model.coordinates
-    width = 2 * dim + 2 if folded else coordinates
-    inputs = conditions_of(features, model)
-    del inputs["template"]
-    state, noise = torch.zeros(batch, frames, width), torch.zeros(batch, frames, coordinates)
-    step = Graph(
-        "step",
-        SpeakerStep(model),
-        {**inputs, "state": state, "step": zeros(batch)},
-        {**{name: CONDITIONS[name] for name in inputs}, "state": FRAMES, "step": BATCH},
-        ("prediction", "kept"),
-    )
-    sampler, last = model.sampler, {"sample": state}
-    if folded and not sampler.literal:
-        last["noise"] = noise
-    parts = [speech, step, Graph("motion", SpeakerMotion(model), last, dict.fromkeys(last, FRAMES), ("offsets",))]
-    if folded:
-        parts.append(Graph("start", SpeakerStart(model), {"noise": noise}, {"noise": FRAMES}, ("state",)))
-    results_of(step)  # what follows from the weights alone is computed here, not in the graph
-    loop = SamplingLoop(
-        state=width,
-        drawn=coordinates,
-        kept=dim,
-        sampler=f"{model.scheduler} DDIM" if model.scheduler == "published" else "ddim",
-        steps=sampler.timesteps,
-        table=update_table(sampler),
-        last_step=-1,
-        decoded="sample",
-        noise=None,
-        noise_of="seed",
-    )
-    return whole_model(model, parts, loop)

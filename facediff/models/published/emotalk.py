@@ -1,9 +1,10 @@
 """EmoTalk (Peng et al.: "EmoTalk: Speech-Driven Emotional Disentanglement for 3D Face Animation", 2023).
 
-Two speech networks, one for what is said and one for how: features of both, how strong the emotion is and whose face it
-is go through a decoder of one layer to the 52 weights of ARKit's face shapes, 30 frames a second. The authors have not
+Two speech networks, one for content and one for emotion: features of both, how strong the emotion is and the speaker
+go through a decoder of one layer to the 52 weights of ARKit's face shapes, 30 frames a second. The authors have not
 released how they train it, so that it is imported; training goes on with the plain error of the weights. From top to
-bottom: the model, its network, the authors' checkpoint. docs/methods.md says what of the published code is an option.
+bottom: the model, its network, the authors' checkpoint. docs/methods.md lists the options for
+choices of the published code.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.graphs import Spoken
+from facediff.models.graphs import SpeechInput
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, exporting, interpolate_ends
 from facediff.models.published.autoregressive import DecoderLayer
-from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean, still_map
-from facediff.models.published.lam_finishing import read_steps
+from facediff.models.published.base import DirectModel, SpeakerTable, still_map
+from facediff.models.published.lam_postprocessing import read_steps
 from facediff.models.published.positions import periodic_bias
 from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
 from facediff.spaces import Space
@@ -39,10 +40,10 @@ if TYPE_CHECKING:
     from facediff.models.published.cards import AuthorFiles, Facts
 
 EMOTION_RATE = 30
-"""Steps a second of the emotion network's Transformer, whatever the motion's frame rate is."""
+"""Steps a second of the emotion network's Transformer, at any frame rate of the motion."""
 
 FINISHING = ("smooth", "blinks")
-"""What the authors' demonstration does with the weights, in its order."""
+"""Steps of the authors' demonstration on the weights, in its order."""
 
 BLINKS = np.array(
     [
@@ -57,11 +58,11 @@ BLINKS = np.array(
 
 @registry.model.register("EmoTalk")
 class EmoTalk(DirectModel):
-    """EmoTalk: what is said and how it is said, from two speech networks, to weights of face shapes.
+    """EmoTalk: content and emotion of speech, from two networks, to weights of face shapes.
 
     Args:
-        dim: channels of the decoder: those of the content, the emotion, its strength and the person together.
-        emotion_dim: channels of how it is said.
+        dim: channels of the decoder: together of the content, the emotion, its strength and the person.
+        emotion_dim: channels of the emotion.
         level_dim: channels of the emotion's strength.
         person_dim: channels of the person.
         num_layers: layers of the decoder.
@@ -74,9 +75,9 @@ class EmoTalk(DirectModel):
             directory.
         emotion_config: its configuration as plain data; if given, its weights are not read from ``emotion_source`` but
             left for a checkpoint to fill in. Checkpoints use it.
-        finish: what is done with the weights, as the demonstration does: ``smooth`` (Savitzky-Golay, a parabola
+        finish: postprocessing of the weights as in the demonstration: ``smooth`` (Savitzky-Golay, a parabola
             through five frames) and ``blinks`` (stored blinks at random in place of the lids' motion); joined by ``+``.
-        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+        options: see :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
     checkpoint_options = ("emotion_config",)  # without it, a file could have weights fetched from anywhere
@@ -129,47 +130,37 @@ class EmoTalk(DirectModel):
         )
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
         """The emotion network's configuration, and rows of the tables with the bias of the published maps."""
         for name in ("obj_vector_level", "obj_vector_person"):
             files.tensors[f"{name}.weight"] = files[f"{name}.weight"] + files[f"{name}.bias"][:, None]
             del files.tensors[f"{name}.bias"]
-        return {"emotion_config": files.speech_network("emotion_encoder", asked["audio_config"])}
+        return {"emotion_config": files.speech_network("emotion_encoder", given_options["audio_config"])}
 
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the arguments as every model does, with the emotion network's configuration in place of its source."""
         config = self.emotion_encoder.network.config.to_dict()
         super().keep_hyperparameters({**arguments, "emotion_config": config})
 
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states of both speech networks side by side, at the frames."""
-        cached = heard.cached_features or ()
-        content = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "features", *cached)
-        return torch.cat([content, self._emotion(heard, frames)], -1)
+        return torch.cat([super().encode_speech(speech, frames), self._emotion(speech, frames)], -1)
 
-    def _emotion(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    def _emotion(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Hidden states of the emotion network, which is resampled twice."""
         encoder = self.emotion_encoder
-        features, steps = encoder.frozen_features(heard.audio, heard.audio_lengths)
+        features, steps = encoder.frozen_features(speech.audio, speech.audio_lengths)
 
         def encode(x: Tensor, count: int) -> Tensor:
             # The published class is never told how many frames there are, and counts 30 a second of its own steps
             # before its Transformer; its hidden states are then resampled to the frames. In floating point as there:
             # 205 steps are 122, not 123.
-            own = x.shape[1] * EMOTION_RATE // int(STEP_RATE)
+            n_frames = x.shape[1] * EMOTION_RATE // int(STEP_RATE)
             if not exporting():
-                own = int(x.shape[1] / STEP_RATE * EMOTION_RATE)
-            return interpolate_ends(encoder.hidden_states(interpolate_ends(x, max(1, own))), count)
+                n_frames = int(x.shape[1] / STEP_RATE * EMOTION_RATE)
+            return interpolate_ends(encoder.hidden_states(interpolate_ends(x, max(1, n_frames))), count)
 
         return by_lengths(features, steps, frames, encode)
-
-    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """The mean squared error; the authors' own losses are not released."""
-        frames = self.trained_frames(batch)
-        predicted = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
-        truth = self.scaled_truth(batch, frames)
-        error = masked_mean((predicted - truth).square(), frames)
-        return {"reconstruction": error, "loss": error}
 
     def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
         """Every frame sees those before it, and its own moment of the emotion; later frames and padding change none."""
@@ -179,7 +170,7 @@ class EmoTalk(DirectModel):
     def generate_frames(
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
-        """All frames in one pass, then what was chosen to finish them."""
+        """All frames in one pass, then the chosen postprocessing."""
         motion = super().generate_frames(batch, frames, seeds=seeds, progress=progress)
         for row, (count, seed) in enumerate(zip(frames.tolist(), seeds, strict=True) if self.finish else ()):
             values = finished(motion[row, :count, :, 0].float().cpu().numpy(), self.finish, self.space, seed)
@@ -234,9 +225,9 @@ class EmoTalkNetwork(nn.Module):
         content, emotion = torch.split(features, list(self.widths), -1)
         frames = features.shape[1]
         memory = self.memory_map(emotion)
-        chosen = self.level.weight[level].expand(*features.shape[:2], -1)
+        level_vector = self.level.weight[level].expand(*features.shape[:2], -1)
         person = self.style(weights)[:, None].expand(-1, frames, -1)
-        parts = [self.content_map(content), torch.relu(self.emotion_map(memory)), chosen, person]
+        parts = [self.content_map(content), torch.relu(self.emotion_map(memory)), level_vector, person]
         x = torch.cat([part.to(memory) for part in parts], -1)
         bias = periodic_bias(frames, self.num_heads, self.period, device=x.device)
         for layer in self.layers:
@@ -247,7 +238,7 @@ class EmoTalkNetwork(nn.Module):
         return motion
 
 
-# What the demonstration does with the weights.
+# Postprocessing of the weights, as in the demonstration.
 
 
 def finished(
@@ -255,7 +246,7 @@ def finished(
 ) -> npt.NDArray[np.float32]:
     """Weights (T, C) after the steps that are chosen.
 
-    Random numbers are those of Python's generator, so that ``random.seed`` gives the demonstration the same blinks.
+    Random numbers come from Python's generator, so that ``random.seed`` gives the demonstration the same blinks.
     """
     result = values.astype(np.float64)
     if "smooth" in steps and len(result) >= 5:  # fewer frames are fewer than the filter has
@@ -263,11 +254,11 @@ def finished(
 
         result = savgol_filter(result, 5, 2, axis=0)
     if "blinks" in steps:
-        drawn, length = random.Random(seed), BLINKS.shape[1]  # noqa: S311 - no secret
+        generator, length = random.Random(seed), BLINKS.shape[1]  # noqa: S311 - no secret
         lids = [space.index("eyeBlinkLeft"), space.index("eyeBlinkRight")]
         result[:, lids] = 0
-        start = drawn.randint(0, 60)
+        start = generator.randint(0, 60)
         while start < len(result) - length:
-            result[start : start + length, lids] = BLINKS[drawn.randint(1, 4) - 1][:, None]
-            start += drawn.randint(60, 180)
+            result[start : start + length, lids] = BLINKS[generator.randint(1, 4) - 1][:, None]
+            start += generator.randint(60, 180)
     return result.astype(np.float32)

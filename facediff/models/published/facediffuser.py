@@ -1,8 +1,7 @@
 """FaceDiffuser (Stan, Haque, Yumak: "FaceDiffuser: Speech-Driven 3D Facial Animation Synthesis Using Diffusion", 2023).
 
 Diffusion over the vertices themselves, with HuBERT's features and recurrent layers. From top to bottom: the model, its
-network, the sampling loop in the width of the network, the authors' checkpoints. docs/methods.md says what
-of the published code is an option here.
+network, its graphs. docs/methods.md says which choices of the published code are options here.
 """
 
 from __future__ import annotations
@@ -18,31 +17,14 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, OptionError
+from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
-from facediff.models.folding import Fold, FoldedSpace, SamplingSpace, VertexSpace, WeightCache
-from facediff.models.graphs import (
-    BATCH,
-    FRAMES,
-    Graph,
-    Graphs,
-    ModelPart,
-    SamplingLoop,
-    Spoken,
-    results_of,
-    update_table,
-)
+from facediff.models.folding import Fold, SamplingSpace, WeightCache
+from facediff.models.graphs import Graphs, ModelPart, SpeechInput
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Layers, Share, Width, all_states, frame_mask
-from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, still_map, whole_model, zeros
-from facediff.models.published.diffusion import (
-    CONDITIONS,
-    DiffusionModel,
-    PosteriorSampler,
-    conditions_of,
-    features_graph,
-    space_of,
-)
+from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, still_map
+from facediff.models.published.diffusion import DiffusionModel, PosteriorSampler, diffusion_graphs
 from facediff.models.samplers import NoiseProcess, NoiseSource, cosine_betas
 from facediff.speech.windows import FrameClock, Rule
 from facediff.utils import SAMPLE_RATE
@@ -60,14 +42,16 @@ class FaceDiffuser(DiffusionModel):
         dropout: between them, in training.
         diffusion_steps: noising steps; all of them are sampled. 500 at 25 frames a second and 1000 otherwise if None.
         skip_steps: sampling starts so many steps later, from noised zeros.
-        noised: what is noised: ``absolute`` vertices as published, which the noise must first bring to the face's place
-            and size, or ``offsets`` from the template, whose noise is of the motion alone.
-        sampling_space: where sampling runs: on the ``vertices``, whose noise is that of the published code for a seed,
-            or ``folded`` into the first map's width, with the same distribution of motion at a cost per step that does
+        noised: ``absolute`` vertices as published, which the noise must first bring to the face's place
+            and size, or ``offsets`` from the template, with noise of the motion alone.
+        sampling_space: where sampling runs: on the ``vertices``, with the published code's noise for a seed, or
+            ``folded`` into the first map's width, with the same distribution of motion at a cost per step that does
             not depend on the vertices.
-        options: those of :class:`DiffusionModel`, and of every model.
+        options: as of :class:`DiffusionModel`, and of every model.
     """
 
+    network: FaceDiffuserNetwork
+    speech_steps: ClassVar[int] = 2
     # HuBERT base as the project's copy of transformers has it; the two lowest layers are frozen.
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         TRAINED_NETWORK, source="facebook/hubert-base-ls960", frozen_layers=2, epsilon=1e-5
@@ -102,13 +86,6 @@ class FaceDiffuser(DiffusionModel):
             n_identities=len(self.identities),
         )
 
-    def choose_sampler(self, name: str | None = None, steps: int | None = None) -> None:
-        """There is one way to sample, over all steps."""
-        raise OptionError.naming(
-            f"FaceDiffuser samples by the reverse process over all of its {self.steps} steps: omit {{sampler}} and "
-            f"{{steps}}, or make the model with skip_steps or sampling_space=folded"
-        )
-
     # Frames.
 
     @property
@@ -121,19 +98,18 @@ class FaceDiffuser(DiffusionModel):
         """As many as the truth has where speech lasts as long, as the published test does."""
         counts = []
         for samples, true_frames in zip(batch.audio_lengths.tolist(), batch.frame_lengths.tolist(), strict=True):
-            own = (
+            count = (
                 # In double precision as published: 36 480 samples at 25 frames a second give one frame less than exact
                 # arithmetic.
                 true_frames if int(samples / SAMPLE_RATE * self.frame_rate) >= true_frames else self.frames_of(samples)
             )
-            counts.append(min(own, self.steps_of(samples) // 2) if self.pairs else own)
+            counts.append(min(count, self.steps_of(samples) // 2) if self.pairs else count)
         return counts
 
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Speech features, two steps side by side for each frame."""
         rule: StepRule = "hidden_cut" if self.pairs else "hidden"
-        cached = heard.cached_features or ()
-        hidden = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, 2 * frames, rule, *cached)
+        hidden = self.speech_features(speech, 2 * frames, rule)
         return hidden.reshape(hidden.shape[0], hidden.shape[1] // 2, 2 * hidden.shape[2])
 
     # Training.
@@ -157,7 +133,7 @@ class FaceDiffuser(DiffusionModel):
         clean = self.scaled_truth(batch, frames) + rest
         noisy = self.process.add_noise(clean, noise[:, :longest], step)
         network = self.network
-        audio = network.audio_map(self.hear(batch, frames))
+        audio = network.audio_map(self.encode_speech(batch, frames))
         hidden = network(network.motion_in(noisy), step, audio, network.style(self.identity_weights(batch)))
         # δ = 1 as published. Motion in raw units never has errors of that size, so that this is half the squared error.
         mask = frame_mask(frames, longest)[..., None]
@@ -165,19 +141,36 @@ class FaceDiffuser(DiffusionModel):
         return F.huber_loss(predicted, clean, reduction="sum") / (frames.sum() * clean.shape[2])
 
     def rest(self, template: Float[Tensor, "batch points dims"]) -> Float[Tensor, "batch 1 coordinates"]:
-        """What is noised where the face does not move: the template, or nothing."""
+        """The noised motion of a face that does not move: the template, or nothing."""
         rest = (template * self.scale).flatten(1)[:, None]
         return rest if self.noised == "absolute" else torch.zeros_like(rest)
 
     # Sampling.
 
-    def state_space(self, rest: Float[Tensor, "batch 1 coordinates"]) -> VertexSpace | FoldedSpace:
-        """Where the reverse process runs."""
-        return space_of(self.network, self.sampling_space, rest)
-
     def graphs(self) -> Graphs:
-        """Speech, one step of the reverse process, the last map."""
-        return facediffuser_graphs(self)
+        """All steps of the reverse process, with fresh noise in each but the last."""
+        width = self.state_space().width
+        return diffusion_graphs(
+            self,
+            DiffuserStep(self),
+            LastMap(self),
+            "ddpm",
+            drawn=width,
+            state=width,
+            decoded="kept",
+            starts=self.skip_steps > 0,
+        )
+
+    @property
+    def sampler(self) -> PosteriorSampler:
+        """All steps but the skipped ones."""
+        return PosteriorSampler(self.process, self.skip_steps)
+
+    def first_state(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
+        """Noise, or noised zeros where the first steps are skipped."""
+        state = self.state_space().noise(noise)
+        noise_share = math.sqrt(1.0 - float(self.process.signal[self.steps - self.skip_steps - 1]))
+        return state * noise_share if self.skip_steps else state
 
     def sample(
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None
@@ -186,7 +179,7 @@ class FaceDiffuser(DiffusionModel):
         network = self.network
         style, space = network.style(self.identity_weights(batch)), self.state_space(self.rest(batch.template))
         # The published code runs HuBERT again in each of up to 1000 steps, with the same result.
-        hidden = speech = network.audio_map(self.hear(batch, frames))
+        hidden = speech = network.audio_map(self.encode_speech(batch, frames))
 
         def denoise(state: Tensor, step: int) -> Tensor:
             nonlocal hidden
@@ -194,18 +187,10 @@ class FaceDiffuser(DiffusionModel):
             hidden = network(space.embed(state), steps, speech, style)
             return space.clean(hidden)
 
-        start = space.noise(noise(speech.new_empty(len(batch), int(frames.max()), space.width)))
-        sampler = PosteriorSampler(self.process, self.skip_steps)
-        if self.skip_steps:  # of noised zeros
-            start = start * self.noise_share
-        sampler.run(denoise, start, noise=lambda like: space.noise(noise(like)), progress=progress)
-        # The last step gives the prediction itself, whose features are the only ones that are mapped to vertices.
+        start = self.first_state(noise(speech.new_empty(len(batch), int(frames.max()), space.width)))
+        self.sampler.run(denoise, start, noise=lambda like: space.noise(noise(like)), progress=progress)
+        # The last step gives the prediction itself; only its features are mapped to vertices.
         return self.offsets_of(network.motion_out(hidden))
-
-    @property
-    def noise_share(self) -> float:
-        """What noise contributes to the noisy motion that sampling starts with."""
-        return math.sqrt(1.0 - float(self.process.signal[self.steps - self.skip_steps - 1]))
 
 
 class FaceDiffuserNetwork(nn.Module):
@@ -244,7 +229,7 @@ class FaceDiffuserNetwork(nn.Module):
         audio: Float[Tensor, "batch frames dim"],
         style: Float[Tensor, "batch dim"],
     ) -> Float[Tensor, "batch frames dim"]:
-        """From noisy motion after ``motion_in`` to what ``motion_out`` makes clean motion of."""
+        """From noisy motion after ``motion_in`` to the features that ``motion_out`` maps to clean motion."""
         batch, frames, width = mapped.shape
         # The convolution runs along the channels of a frame, not over time.
         motion = torch.relu(self.smooth(mapped.reshape(batch * frames, 1, width)))
@@ -271,20 +256,11 @@ class DiffuserStep(ModelPart[FaceDiffuser]):
         state: Float[Tensor, "batch frames state"],
         step: Int[Tensor, " batch"],
     ) -> tuple[Tensor, Tensor]:
-        """Where vertices are noised with the face, the template is a part of what is predicted."""
+        """Where vertices are noised with the face, the template is a part of the prediction."""
         model, network = self.model, self.model.network
         space = model.state_space(model.rest(template))
         hidden = network(space.embed(state), step, features, network.style(model.weights_of(identity)))
         return space.clean(hidden), hidden
-
-
-class DiffuserStart(ModelPart[FaceDiffuser]):
-    """Unit noise to the motion that sampling starts from where its first steps are skipped."""
-
-    def forward(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
-        """Noised zeros."""
-        space = self.model.state_space(torch.zeros(1, 1, self.model.coordinates))
-        return space.noise(noise) * self.model.noise_share
 
 
 class LastMap(ModelPart[FaceDiffuser]):
@@ -293,40 +269,3 @@ class LastMap(ModelPart[FaceDiffuser]):
     def forward(self, sample: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""
         return self.model.offsets_of(self.model.network.motion_out(sample))
-
-
-def facediffuser_graphs(model: FaceDiffuser) -> Graphs:
-    """FaceDiffuser over all of its steps, with fresh noise in each but the last."""
-    speech = features_graph(model, model.network, 2)
-    features, space = results_of(speech), model.state_space(torch.zeros(1, 1, model.coordinates))
-    batch, frames, dim = features.shape
-    step = Graph(
-        "step",
-        DiffuserStep(model),
-        {**conditions_of(features, model), "state": torch.zeros(batch, frames, space.width), "step": zeros(batch)},
-        {**CONDITIONS, "state": FRAMES, "step": BATCH},
-        ("prediction", "kept"),
-    )
-    last = Graph("motion", LastMap(model), {"sample": features}, {"sample": FRAMES}, ("offsets",))
-    sampler, parts = PosteriorSampler(model.process, model.skip_steps), [speech, step, last]
-    if model.skip_steps:
-        noise = {"noise": torch.zeros(batch, frames, space.width)}
-        parts.append(Graph("start", DiffuserStart(model), noise, {"noise": FRAMES}, ("state",)))
-    results_of(step)  # what follows from the weights alone is computed here, not in the graph
-    root = None
-    if model.sampling_space == "folded":
-        with torch.no_grad():
-            root = space.noise(torch.eye(space.width)[None])[0]
-    loop = SamplingLoop(
-        state=space.width,
-        drawn=space.width,
-        kept=dim,
-        sampler="ddpm",
-        steps=sampler.timesteps,
-        table=update_table(sampler),
-        last_step=-1,
-        decoded="kept",
-        noise=root,
-        noise_of="seed",
-    )
-    return whole_model(model, parts, loop)

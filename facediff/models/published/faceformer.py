@@ -1,7 +1,7 @@
 """FaceFormer (Fan, Lin, Saito, Wang, Komura: "FaceFormer: Speech-Driven 3D Facial Animation with Transformers", 2022).
 
-An autoregressive Transformer decoder over wav2vec 2.0; the network is that of ``autoregressive.py`` with one column of
-a table for each speaker. docs/methods.md says what of the published code is an option here.
+An autoregressive Transformer decoder over wav2vec 2.0; the network is the one of ``autoregressive.py`` with one column
+of a table for each speaker. docs/methods.md lists the options for choices of the published code.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class FaceFormer(OffsetModel):
     """FaceFormer: an autoregressive Transformer with periodic positions and biased attention.
 
     Args:
-        options: those of :class:`OffsetModel`, of the other methods with this decoder, see
+        options: see :class:`OffsetModel`, of the other methods with this decoder, see
             :class:`~facediff.models.published.autoregressive.AutoregressiveModel`, and of every model.
     """
 
@@ -36,7 +36,7 @@ class FaceFormer(OffsetModel):
 
     def __init__(self, **options: Any) -> None:  # noqa: ANN401
         super().__init__(**options)
-        # The style is a map of the one-hot identity without a bias, hence a table of rows; its order is that of the
+        # The style is a map of the one-hot identity without a bias, hence a table of rows; its order is the
         # training command line, which no checkpoint records.
         self.network = AutoregressiveNetwork(
             audio_width=self.audio_width,

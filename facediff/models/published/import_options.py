@@ -1,4 +1,4 @@
-"""What a user says of a checkpoint of a published method; the command line and Python take it from here."""
+"""The options of an import of a published method's checkpoint; the command line and Python take them from here."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ MODEL_HPARAMS = ("do_normalize", "epsilon", "num_heads", "codec_heads", "style_h
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What no checkpoint of a published method holds.
+    """Facts that no checkpoint of a published method holds.
 
     Attributes:
-        dataset: what it was trained on, where the number of vertices does not say it; of UniTalker the data set whose
+        dataset: the data set, where the number of vertices does not tell it; of UniTalker the data set whose
             faces are animated, D3 (ARKit's weights) by default
         identities: training identities in the order of the training command; by default the data set's usual ones
         templates: neutral faces by speaker (templates.pkl), of DiffPoseTalk a speaker's shape (.npy, or an .npz with
@@ -46,10 +46,10 @@ class ImportOptions:
             a scale; in Python also the arrays by name
         data_root: folder of UniTalker's data release, with principal components and neutral faces
         template_row: neutral face of that release, by default the published demo's
-        hparams: JSON file with what the checkpoint does not say: any of these options by name, audio_config (or
+        hparams: JSON file with facts that the checkpoint lacks: any of these options by name, audio_config (or
             encoder_config) as an object, options of the model; in Python also its content
         option: an option of the model or its audio encoder that no file holds, such as num_heads=4; may be repeated;
-            ignore=PREFIX leaves out the tensors whose names begin so
+            ignore=PREFIX leaves out the tensors with this prefix
         model_options: the same options by name, in Python
     """
 
@@ -69,30 +69,27 @@ class ImportOptions:
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> ImportOptions:
         """Keyword arguments of a Python function; those that are no field are options of the model."""
-        own = {name for name in cls.__dataclass_fields__ if name not in ("option", "model_options")}
-        chosen = {name: value for name, value in options.items() if name in own}
-        return cls(**chosen, model_options={name: value for name, value in options.items() if name not in own})
+        fields = {name for name in cls.__dataclass_fields__ if name not in ("option", "model_options")}
+        import_options = {name: value for name, value in options.items() if name in fields}
+        return cls(
+            **import_options, model_options={name: value for name, value in options.items() if name not in fields}
+        )
 
     def with_hparams(self) -> tuple[ImportOptions, list[str]]:
-        """These options, with those of the file where they are not given, and the names that are no option here."""
-        if self.hparams is None:
+        """These options, with the file's where they are not given, and the names that are no option here."""
+        content = read_object("hparams", self.hparams)
+        if content is None:
             return self, []
-        content: Any = self.hparams
-        if not isinstance(content, Mapping):
-            path, remedy = Path(content), "expected a JSON object of options by name"
-            content = load_json(path, name=f"--hparams {path}", remedy=remedy)
-            if not isinstance(content, dict):
-                raise OptionError.naming(f"{{hparams}} {path}: holds no options by name; {remedy}")
-            if isinstance(content.get("data_root"), str):
-                content["data_root"] = str(path.parent / content["data_root"])
-        own = {ALIASES.get(name, name): value for name, value in content.items()}
-        chosen: dict[str, Any] = {}
+        if not isinstance(self.hparams, Mapping) and isinstance(content.get("data_root"), str):
+            content = {**content, "data_root": str(Path(self.hparams or "").parent / content["data_root"])}
+        stated = {ALIASES.get(name, name): value for name, value in content.items()}
+        accepted: dict[str, Any] = {}
         for name, kind in HPARAMS.items():
-            if getattr(self, name) is None and isinstance(own.get(name), kind):
-                chosen[name] = Path(own[name]) if name == "data_root" else own[name]
-        flags = {name: own[name] for name in MODEL_HPARAMS if name in own}
-        left = sorted(own.keys() - HPARAMS.keys() - set(MODEL_HPARAMS))
-        return replace(self, **chosen, model_options={**flags, **self.model_options}), left
+            if getattr(self, name) is None and isinstance(stated.get(name), kind):
+                accepted[name] = Path(stated[name]) if name == "data_root" else stated[name]
+        flags = {name: stated[name] for name in MODEL_HPARAMS if name in stated}
+        left = sorted(stated.keys() - HPARAMS.keys() - set(MODEL_HPARAMS))
+        return replace(self, **accepted, model_options={**flags, **self.model_options}), left
 
     def all_model_options(self) -> dict[str, Any]:
         """Options of the model and its audio encoder by name; ``ignore`` is a list, since it may be repeated."""
@@ -108,3 +105,14 @@ class ImportOptions:
             else:
                 options[name] = value
         return options
+
+
+def read_object(option: str, source: str | Path | Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The values by name of an option that is a JSON file or, in Python, its content."""
+    if source is None or isinstance(source, Mapping):
+        return source
+    remedy = "expected a JSON object of values by name"
+    content: Any = load_json(Path(source), name=f"--{option.replace('_', '-')} {source}", remedy=remedy)
+    if not isinstance(content, dict):
+        raise OptionError(option, remedy, source)
+    return content

@@ -1,8 +1,8 @@
 """LAM-Audio2Expression (aigc3d, 2025): speech to the 52 weights of ARKit's face shapes, 30 frames a second.
 
-wav2vec 2.0, whose convolutions' output is resampled to the frames, then convolutions over frames that know the speaker,
-six Transformer layers in the larger variant, and a sigmoid. From top to bottom: the model, its network, the authors'
-checkpoint. docs/methods.md says what of the published code is an option here.
+The output of wav2vec 2.0's convolutions is resampled to the frames, then convolutions over frames that know the
+speaker, six Transformer layers in the larger variant, and a sigmoid. From top to bottom: the model, its network, the
+authors' checkpoint. docs/methods.md lists the options for choices of the published code.
 """
 
 from __future__ import annotations
@@ -19,14 +19,12 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress, with_speech
-from facediff.models.layers import Heads, Share, Width, exporting, frame_mask
-from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean
+from facediff.models.layers import Heads, Share, Width, check_heads, exporting, frame_mask
+from facediff.models.published.base import DirectModel, SpeakerTable
 from facediff.models.published.convolutions import ConvolutionStack
-from facediff.models.published.lam_finishing import CONTEXT_FRAMES, Finish, Finishing
+from facediff.models.published.lam_postprocessing import CONTEXT_FRAMES, PostprocessedRecording, Postprocessing
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import Space
 from facediff.utils import SAMPLE_RATE
@@ -55,10 +53,10 @@ class LamAudio2Expression(DirectModel):
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
         dropout: on the features of speech and in the Transformer.
         chunks: how speech is cut into the published stream's chunks.
-        finish: what is done with the weights afterwards, as names joined by ``+``: ``mouth`` (damped in silence),
+        finish: postprocessing of the weights, as names joined by ``+``: ``mouth`` (damped in silence),
             ``smooth``, ``symmetric`` as published or ``halves`` as meant, and ``blinks``; see
-            :mod:`facediff.models.published.lam_finishing`.
-        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+            :mod:`facediff.models.published.lam_postprocessing`.
+        options: see :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
     clock_rule = "up"  # a frame for every part of one that speech lasts
@@ -83,10 +81,10 @@ class LamAudio2Expression(DirectModel):
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
-        if transformer_layers and dim % num_heads:
-            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be a multiple of num_heads")
+        if transformer_layers:
+            check_heads(dim=dim, num_heads=num_heads)
         self.chunks: Chunks = chunks
-        self.finishing = Finishing.of(finish, self.space, self.frame_rate)
+        self.finishing = Postprocessing.of(finish, self.space, self.frame_rate)
         self.network = LamNetwork(
             audio_width=self.audio_width,
             space=self.space,
@@ -101,24 +99,15 @@ class LamAudio2Expression(DirectModel):
         )
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
         """The map of one-hot speakers is a convolution over one frame."""
         name = "identity_encoder.id_mlp.weight"
         files.tensors[name] = files[name].flatten(1)
         return {}
 
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
-        """Hidden states of the speech network, whose convolutions' output is resampled to the frames."""
-        cached = heard.cached_features or ()
-        return self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "features", *cached)
-
-    def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """The mean absolute error."""
-        frames = self.trained_frames(batch)
-        predicted = self.decode(self.hear(batch, frames), self.identity_weights(batch), frames)
-        truth = self.scaled_truth(batch, frames)
-        error = masked_mean((predicted - truth).abs(), frames)
-        return {"reconstruction": error, "loss": error}
+    def penalty(self, difference: Float[Tensor, "batch frames coordinates"]) -> Tensor:
+        """The absolute error."""
+        return difference.abs()
 
     def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
         """Every frame sees its neighbours, and of the larger variant all others."""
@@ -129,7 +118,7 @@ class LamAudio2Expression(DirectModel):
     def generate_frames(
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
-        """All frames in one pass or chunk by chunk, then what was chosen to finish them."""
+        """All frames in one pass or chunk by chunk, then the chosen postprocessing."""
         if self.chunks == "none" and not self.finishing.steps:
             return super().generate_frames(batch, frames, seeds=seeds, progress=progress)
         motion = batch.template.new_zeros(len(batch.audio), int(frames.max()), *batch.template.shape[1:])
@@ -138,12 +127,12 @@ class LamAudio2Expression(DirectModel):
             speech = clip.audio[0, : int(clip.audio_lengths[0])]
             finish = self.finishing.start(seed)
             if self.chunks == "none":
-                own = super().generate_frames(clip, frames[row : row + 1], seeds=[seed])[0]
-                finished = finish.whole(own[..., 0].float().cpu().numpy(), speech.float().cpu().numpy())
+                raw = super().generate_frames(clip, frames[row : row + 1], seeds=[seed])[0]
+                processed = finish.whole(raw[..., 0].float().cpu().numpy(), speech.float().cpu().numpy())
             else:
                 parts = self.stream_chunks(clip, SAMPLE_RATE, context=self.chunks == "context", finish=finish)
-                finished = np.concatenate(list(parts))[:count]
-            motion[row, : len(finished)] = torch.from_numpy(finished).to(motion).view(-1, *motion.shape[2:])
+                processed = np.concatenate(list(parts))[:count]
+            motion[row, : len(processed)] = torch.from_numpy(processed).to(motion).view(-1, *motion.shape[2:])
         return motion
 
     @property
@@ -154,16 +143,16 @@ class LamAudio2Expression(DirectModel):
         return " and ".join(filter(None, (chunks, finish)))
 
     def stream_chunks(
-        self, clip: Batch, samples: int, *, context: bool, finish: Finish | None = None
+        self, clip: Batch, samples: int, *, context: bool, finish: PostprocessedRecording | None = None
     ) -> Iterator[np.ndarray]:
-        """What the published stream gives of each chunk of one clip's speech, (frames, coordinates).
+        """The published stream's output for each chunk of one clip's speech, (frames, coordinates).
 
         Args:
             clip: a batch of one clip.
             samples: of a chunk.
             context: compute each chunk after the speech before it; else after silence. The published code never notes
                 that the first chunk is over, so that each has silence before it.
-            finish: what is done with the weights of each chunk.
+            finish: postprocessing of the weights of each chunk.
         """
         speech = clip.audio[0, : int(clip.audio_lengths[0])]
         window = SAMPLE_RATE * CONTEXT_FRAMES // 30
@@ -174,11 +163,11 @@ class LamAudio2Expression(DirectModel):
             before = speech.new_zeros(window - len(chunk))
             past = speech[max(0, start - len(before)) : start] if context else speech[:0]
             before[len(before) - len(past) :] = past
-            heard = torch.cat([before, chunk])
-            count = self.frames_of(len(heard))
+            sound = torch.cat([before, chunk])
+            count = self.frames_of(len(sound))
             # Rounded down as the published code does: a chunk of no whole number of frames gives one frame more.
             first = int(count - len(chunk) / SAMPLE_RATE * self.frame_rate)
-            window_clip = with_speech(clip, heard, count)
+            window_clip = with_speech(clip, sound, count)
             motion = super().generate_frames(window_clip, window_clip.frame_lengths, seeds=[0])[0]
             values = motion.flatten(1)[first:].detach().float().cpu().numpy()
             yield values if finish is None else finish.chunk(values, chunk.float().cpu().numpy())

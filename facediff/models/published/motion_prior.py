@@ -1,7 +1,7 @@
-"""A discrete prior of facial motion: an autoencoder whose frames are a few entries each of a learnt table of codes.
+"""A discrete prior of facial motion: an autoencoder with frames of a few entries each of a learnt table of codes.
 
-The first stage of CodeTalker. Motion goes through two halves that are built alike (:class:`Half`); between them, every
-frame's vector is cut into tokens, and each token becomes the nearest code. Both halves attend to all frames of a
+The first stage of CodeTalker. Motion goes through two coders that are built alike (:class:`PriorCoder`); between them,
+every frame's vector is cut into tokens, and each token becomes the nearest code. Both coders attend to all frames of a
 clip and normalise over them, so clips of different lengths never go through them together.
 """
 
@@ -42,7 +42,7 @@ class PriorBlock(nn.Module):
         normed, dim = self.attention_norm(x), x.shape[-1]
         last = slice(0 if newest is None else x.shape[1] - newest, None)
         # In generation only the newest frame is wanted of the last layer, so only its query is projected; keys and
-        # values are still those of all frames, since the normalisation before has changed all of them.
+        # values are still of all frames, since the normalisation before has changed all of them.
         if newest is None:
             query, key, value = self.project(normed).chunk(3, -1)
         else:
@@ -54,7 +54,7 @@ class PriorBlock(nn.Module):
         return x + self.second(F.gelu(self.first(self.hidden_norm(x)), approximate="tanh"))
 
 
-class Half(nn.Module):
+class PriorCoder(nn.Module):
     """One half of the autoencoder: a convolution over time, and Transformer layers.
 
     Its sizes are options of ``CodeTalker``.
@@ -102,12 +102,12 @@ class Codes(NamedTuple):
 
     Attributes:
         values: the codes, through which gradients pass as if they were the tokens.
-        chosen: the codes themselves, without the tokens' gradients.
+        entries: the codes themselves, without the tokens' gradients.
         numbers: which codes they are.
     """
 
     values: Float[Tensor, "batch frames width"]
-    chosen: Float[Tensor, "batch frames width"]
+    entries: Float[Tensor, "batch frames width"]
     numbers: Int[Tensor, "batch frames tokens"]
 
 
@@ -132,13 +132,13 @@ class MotionPrior(nn.Module):
         super().__init__()
         self.tokens, self.width = tokens, tokens * token_dim
         self.motion_in = nn.Linear(coordinates, dim)
-        self.encoder = Half(dim=dim, **options)
+        self.encoder = PriorCoder(dim=dim, **options)
         self.to_tokens = nn.Linear(dim, self.width) if token_maps else nn.Identity()
         # Uniform in ±1/codes, as in the public VQ-VAE implementations that the released code follows: all codes start
         # so close that every one of them has a chance of being the nearest.
         self.codebook = nn.Parameter(torch.empty(codes, token_dim).uniform_(-1 / codes, 1 / codes))
         self.from_tokens = nn.Linear(self.width, dim) if token_maps else nn.Identity()
-        self.decoder = Half(dim=dim, **options)
+        self.decoder = PriorCoder(dim=dim, **options)
         self.motion_out = nn.Linear(dim, coordinates, bias=out_bias)
 
     def encode(self, motion: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames width"]:
@@ -154,11 +154,11 @@ class MotionPrior(nn.Module):
             # another code, and all frames that follow differ from it on.
             distances = flat.square().sum(1, keepdim=True) + self.codebook.square().sum(1) - 2 * flat @ self.codebook.T
             numbers = distances.argmin(1)
-            chosen = self.codebook[numbers].view(tokens.shape)
+            entries = self.codebook[numbers].view(tokens.shape)
             # The straight-through estimator: the value is the code's, the gradient the token's, since the choice of a
             # code has no derivative.
-            values = tokens + (chosen - tokens).detach()
-        return Codes(values, chosen, numbers.view(*tokens.shape[:2], self.tokens))
+            values = tokens + (entries - tokens).detach()
+        return Codes(values, entries, numbers.view(*tokens.shape[:2], self.tokens))
 
     def decode(self, values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames coordinates"]:
         """Motion of clips of one length."""

@@ -1,4 +1,4 @@
-"""What the published methods in parameters have in common: standardised channels, of which a network sees some."""
+"""Common parts of the published methods in parameters: standardised channels, of which a network sees some."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.checkpoint_content import PersonStyles
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import SpeechStream, Style
-from facediff.models.layers import Heads, Layers, Width
+from facediff.models.layers import Heads, Layers, Width, check_heads
 from facediff.models.published.base import NO_STYLE, PublishedModel
 from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder
 from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 
 DEAD = 0.01
-"""Channels whose deviation is a smaller share than this of the largest are divided by that share of it: a channel that
-hardly moves would otherwise be blown up to noise."""
+"""Smallest divisor of a channel, as a share of the largest deviation: a channel that hardly moves would otherwise be
+blown up to noise."""
 
 
 class ParametricModel(PublishedModel):
@@ -42,7 +41,7 @@ class ParametricModel(PublishedModel):
         style_layers: layers of the style encoder.
         style_heads: its attention heads.
         style_rows: rows of its table of positions.
-        options: those of :class:`~facediff.models.published.base.PublishedModel`.
+        options: see :class:`~facediff.models.published.base.PublishedModel`.
 
     Attributes:
         style_encoder: of a clip; a method makes it by :attr:`make_style_encoder` in its place among its modules, on
@@ -70,18 +69,17 @@ class ParametricModel(PublishedModel):
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(unseen_identity=unseen_identity, **options)
-        if style_dim % style_heads or style_dim % 2:
-            raise ArgumentError({"style_dim": style_dim}, "it must be even, and a multiple of its attention heads")
+        check_heads(style_dim=style_dim, style_heads=style_heads, even=True)
         self.plan_long_speech("extend")  # the methods cut speech into windows by themselves
         numbers = self.coordinates
         turned = () if self.space.is_vertices else self.space.rotations
-        still = {place for turn in turned if turn.joint == "head" and not head for place in turn.channels}
+        still = {channel for turn in turned if turn.joint == "head" and not head for channel in turn.channels}
         for turn in turned:
             if turn.joint == "jaw" and turn.form == "axis_angle" and self.jaw_opens:
                 still |= {*turn.channels[1:]}
-        self.modelled = tuple(place for place in range(numbers) if place not in still)
+        self.modelled = tuple(channel for channel in range(numbers) if channel not in still)
         turning = self.space.head if not self.space.is_vertices else ()
-        self.head_places = tuple(i for i, place in enumerate(self.modelled) if place in turning)
+        self.head_places = tuple(i for i, channel in enumerate(self.modelled) if channel in turning)
         self.resting = () if head else tuple(turning)
         self.style_dim = style_dim
         self.make_style_encoder = partial(
@@ -120,7 +118,7 @@ class ParametricModel(PublishedModel):
         return {}
 
     def styled_identities(self) -> list[str]:
-        """Those of whom a style is stored."""
+        """The speakers with a stored style."""
         return PersonStyles.styled_identities(self)
 
     def default_style(self, identity: str) -> Reference | Style:
@@ -138,14 +136,14 @@ class ParametricModel(PublishedModel):
 
         Channels that the network does not see have their mean, and a head that stays still has 0.
         """
-        whole = motion.new_zeros(len(motion), len(self.motion_mean))
-        whole[:, list(self.modelled)] = motion
-        whole = whole * self.motion_std + self.motion_mean
-        whole[:, list(self.resting)] = 0.0
-        return whole.view(len(whole), self.n_vertices, self.dims)
+        frames = motion.new_zeros(len(motion), len(self.motion_mean))
+        frames[:, list(self.modelled)] = motion
+        frames = frames * self.motion_std + self.motion_mean
+        frames[:, list(self.resting)] = 0.0
+        return frames.view(len(frames), self.n_vertices, self.dims)
 
     def shapes_of(self, batch: Batch) -> Float[Tensor, "batch shape_dim"]:
-        """Each clip's coefficients of shape; those of the first identity for an unknown one."""
+        """Each clip's coefficients of shape; the first identity's for an unknown one."""
         return self.shapes[batch.identity.clamp_min(0)]
 
 
@@ -153,10 +151,10 @@ def window_at(
     values: Float[Tensor, "batch frames width"], lengths: Int[Tensor, " batch"], first: Int[Tensor, " batch"], size: int
 ) -> tuple[Float[Tensor, "batch size width"], Bool[Tensor, "batch size"]]:
     """A window of each clip and which of its frames are the clip's; the others are zero."""
-    places = first[:, None] + torch.arange(size, device=values.device)
-    valid = places < lengths[:, None]
+    indices = first[:, None] + torch.arange(size, device=values.device)
+    valid = indices < lengths[:, None]
     rows = torch.arange(len(values), device=values.device)[:, None]
-    return values[rows, places.clamp_max(values.shape[1] - 1)] * valid[..., None], valid
+    return values[rows, indices.clamp_max(values.shape[1] - 1)] * valid[..., None], valid
 
 
 def statistics_of(content: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Tensor, Tensor]:
@@ -184,9 +182,4 @@ class PieceStream(SpeechStream):
 
     def _left(self, end: int, frames: int | None) -> int:
         """Frames to give out at the end, of all that the speech has or of so many."""
-        total = end if frames is None else frames
-        if end < 1 or total < self.frames:
-            raise FaceDiffError(
-                f"frames: {total} are none, or fewer than the {self.frames} that were given out already"
-            )
-        return total - self.frames
+        return self._total(end, frames) - self.frames

@@ -13,9 +13,9 @@ def periodic_positions(
     frames: int, dim: int, period: int, *, start: int = 0, device: torch.device | None = None
 ) -> Float[Tensor, "frames dim"]:
     """Row p: sin((p mod period)·w_m) in the even channels 2m, the cosines in the odd ones, w_m = 10000^(−2m/dim)."""
-    places = torch.arange(start, start + frames, device=device) % period
+    steps = torch.arange(start, start + frames, device=device) % period
     rates = torch.exp(torch.arange(0, dim, 2, device=device).float() * (-math.log(10_000.0) / dim))
-    angle = places[:, None].float() * rates
+    angle = steps[:, None].float() * rates
     return torch.stack([angle.sin(), angle.cos()], -1).flatten(1)
 
 

@@ -2,7 +2,7 @@
 
 A Transformer decoder that makes all frames in one pass, and in training a lip reader, which reads the generated lips
 and must find what a frozen speech recogniser finds in the speech. From top to bottom: the model, its network, the lip
-reader, the authors' checkpoints. docs/methods.md says what of the published code is an option here.
+reader, the authors' checkpoints. docs/methods.md lists the options for choices of the published code.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Assets, Batch
-from facediff.errors import ArgumentError, OptionError
+from facediff.errors import OptionError
 from facediff.models.audio_encoders import (
     AudioEncoderFactory,
     Lengths,
@@ -30,9 +30,19 @@ from facediff.models.audio_encoders import (
     standardise,
 )
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.graphs import Spoken
+from facediff.models.graphs import SpeechInput
 from facediff.models.inference import BatchMotion
-from facediff.models.layers import Heads, Layers, Share, Weight, Width, frame_mask, interpolate_ends, needed_mask
+from facediff.models.layers import (
+    Heads,
+    Layers,
+    Share,
+    Weight,
+    Width,
+    check_heads,
+    frame_mask,
+    interpolate_ends,
+    needed_mask,
+)
 from facediff.models.published.base import TRAINED_NETWORK, DirectModel, masked_mean, still_map
 from facediff.models.published.cards import ENCODER_NAMES, renamed
 from facediff.models.squared_errors import squared_errors
@@ -44,7 +54,7 @@ if TYPE_CHECKING:
     from facediff.models.published.cards import AuthorFiles, Facts
 
 LipReading = Literal["text", "none"]
-"""What a lip reader learns from in training: a frozen recogniser's ``text``; with ``none`` there is no lip reader."""
+"""The lip reader's target in training: a frozen recogniser's ``text``; with ``none`` there is no lip reader."""
 
 
 @registry.model.register("SelfTalk")
@@ -72,7 +82,7 @@ class SelfTalk(DirectModel):
         consistency_weight: factor of the squared distance of the lip reader's features from the recogniser's.
         ctc_weight: factor of the CTC loss of the lip reader's letters and the recogniser's transcript.
         unseen_identity: as for every model; the method knows no identities, so it is tested once.
-        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+        options: see :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
     checkpoint_options = ("text_config",)  # without it, a file could have weights fetched from anywhere
@@ -104,8 +114,7 @@ class SelfTalk(DirectModel):
         super().__init__(unseen_identity=unseen_identity, **options)
         self.windows = type(self.windows)(above=math.inf)  # the decoder has no table of positions
         dim = dim or (1024 if self.pairs else 512)
-        if dim % num_heads:
-            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be a multiple of heads")
+        check_heads(dim=dim, num_heads=num_heads)
         self.vertex_weight, self.velocity_weight = vertex_weight, velocity_weight
         self.consistency_weight, self.ctc_weight = consistency_weight, ctc_weight
         self.network = SelfTalkNetwork(
@@ -135,20 +144,20 @@ class SelfTalk(DirectModel):
         super().keep_hyperparameters({**arguments, "text_config": config})
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
         """The lip reader and its recogniser, which only training needs, are left out unless they are asked for."""
-        if asked.get("lip_reader") != "text":
+        if given_options.get("lip_reader") != "text":
             for prefix in ("text_encoder.", "lip_map.", "transformer.", "lm_head."):
                 files.ignore(prefix, "only training needs the lip reader (--option lip_reader=text keeps it)")
             return {"lip_reader": "none"}
-        if asked.get("lip_vertices") is None:
+        if given_options.get("lip_vertices") is None:
             raise OptionError.naming(
                 f"{{option}} lip_reader=text: no file holds the {files.size('lip_map.weight', 1) // 3} vertices that "
                 f"the lip reader sees; give them in the authors' order as {{option}} lip_vertices=[0,1,...]"
             )
         for name in files.beginning("text_encoder."):
             files.tensors[renamed(name, (("^text_encoder", "text.network"), *ENCODER_NAMES))] = files.tensors.pop(name)
-        config = files.backbone("text.network.wav2vec2.", "wav2vec2", asked["audio_config"] or {})
+        config = files.backbone("text.network.wav2vec2.", "wav2vec2", given_options["audio_config"] or {})
         return {
             "lip_layers": files.count("transformer.encoder.layers."),
             "lip_feed_forward_dim": files.size("transformer.encoder.layers.0.linear1.weight", 0),
@@ -168,16 +177,15 @@ class SelfTalk(DirectModel):
         return LipReader(vertices, self.dims, dim=text.width, letters=text.letters, **self._reader_options)
 
     @property
-    def heard_steps(self) -> int:
+    def speech_steps(self) -> int:
         """Two where speech comes in pairs."""
         return 2 if self.pairs else 1
 
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
+    def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Speech features of each frame; where speech comes in pairs, two hidden states side by side."""
         rule: StepRule = "hidden_cut" if self.pairs else "features"
-        cached = heard.cached_features or ()
-        steps = self.heard_steps
-        hidden = self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, steps * frames, rule, *cached)
+        steps = self.speech_steps
+        hidden = self.speech_features(speech, steps * frames, rule)
         return hidden.reshape(hidden.shape[0], hidden.shape[1] // steps, steps * hidden.shape[2])
 
     # Training.
@@ -186,7 +194,7 @@ class SelfTalk(DirectModel):
         """Squared errors of positions and velocities, and the two losses of the lip reader."""
         frames = self.trained_frames(batch)
         truth = self.scaled_truth(batch, frames)
-        motion = self.network(self.hear(batch, frames), frames)
+        motion = self.network(self.encode_speech(batch, frames), frames)
         position, change = squared_errors(motion, truth, frames)
         terms = {
             "reconstruction": position / (frames.sum() * truth.shape[2]),
@@ -194,10 +202,10 @@ class SelfTalk(DirectModel):
         }
         loss = self.vertex_weight * terms["reconstruction"] + self.velocity_weight * terms["velocity"]
         if self.text is not None and self.reader is not None:
-            heard = self.text(batch.audio, batch.audio_lengths)
-            read = self.reader(motion, frames, heard.steps)
-            terms["consistency"] = masked_mean((read.features - heard.features).square(), heard.steps)
-            terms["ctc"] = ctc(read.letters, heard.transcripts(), heard.steps, self.text.blank)
+            letters = self.text(batch.audio, batch.audio_lengths)
+            read = self.reader(motion, frames, letters.steps)
+            terms["consistency"] = masked_mean((read.features - letters.features).square(), letters.steps)
+            terms["ctc"] = ctc(read.letters, letters.transcripts(), letters.steps, self.text.blank)
             loss = loss + self.consistency_weight * terms["consistency"] + self.ctc_weight * terms["ctc"]
         return {**terms, "loss": loss}
 
@@ -217,11 +225,7 @@ class SelfTalk(DirectModel):
     def read_lips(
         self, motion: BatchMotion, frames: Int[Tensor, " batch"] | None = None
     ) -> Float[Tensor, "batch steps letters"]:
-        """What the lip reader reads: one number for each letter of its recogniser, at 50 steps a second.
-
-        Args:
-            motion: offsets from the template, in the corpus's unit.
-            frames: valid frames of each clip; all if None.
+        """The lip reader's output: one number for each letter of its recogniser, at 50 steps a second.
 
         A model that was made or imported without its lip reader is refused.
         """
@@ -282,7 +286,7 @@ def padding_of(lengths: Int[Tensor, " batch"], longest: int) -> Tensor | None:
 # The lip reader.
 
 
-class Read(NamedTuple):
+class LipFeatures(NamedTuple):
     """The lip reader's output: its features, and a number for each letter, both (batch, steps, …)."""
 
     features: Tensor
@@ -310,8 +314,8 @@ class LipReader(nn.Module):
         dropout: float,
     ) -> None:
         super().__init__()
-        places = dims * torch.tensor(list(vertices))[:, None] + torch.arange(dims)
-        self.register_buffer("columns", places.flatten(), persistent=False)
+        indices = dims * torch.tensor(list(vertices))[:, None] + torch.arange(dims)
+        self.register_buffer("columns", indices.flatten(), persistent=False)
         self.lip_map = nn.Linear(dims * len(vertices), dim)
         layer = nn.TransformerEncoderLayer(dim, self.HEADS, hidden_dim, dropout, batch_first=True)
         # Nested tensors, PyTorch's default here, warn that they are a prototype.
@@ -326,7 +330,7 @@ class LipReader(nn.Module):
         motion: Float[Tensor, "batch frames coordinates"],
         frames: Int[Tensor, " batch"],
         steps: Int[Tensor, " batch"],
-    ) -> Read:
+    ) -> LipFeatures:
         """Read offsets of all vertices, each clip in so many steps."""
         # Offsets without the template: a lip reader that saw faces would tell speakers by their lips' shape.
         mapped = self.lip_map(motion[..., self.columns])
@@ -338,7 +342,7 @@ class LipReader(nn.Module):
         features = self.transformer(
             x, x, src_key_padding_mask=padding, tgt_key_padding_mask=padding, memory_key_padding_mask=padding
         )
-        return Read(features, self.lm_head(features))
+        return LipFeatures(features, self.lm_head(features))
 
 
 class Transcription(NamedTuple):

@@ -1,8 +1,8 @@
 """TalkingStyle (Song et al.: "Personalized Speech-Driven 3D Facial Animation with Style Preservation", 2024).
 
 FaceFormer's autoregressive decoder with six layers over HuBERT large, and a style of two tables of speakers. From top
-to bottom: the model, the style, the authors' checkpoints. docs/methods.md says what of the published code
-is an option here.
+to bottom: the model, the style, the authors' checkpoints. docs/methods.md lists the options for choices
+of the published code.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable
 from facediff.models.squared_errors import mean_squared_error
 
 MouthLoss = Literal["flattened", "vertices"]
-"""What the numbers of the lips' vertices count: the flattened coordinates, or vertices."""
+"""Meaning of the numbers of the lips' vertices: positions among flattened coordinates, or vertices."""
 
 
 MOUTH_SHARE = 0.6
-"""Share of the mouth in the loss; the rest is that of all coordinates."""
+"""Share of the mouth in the loss; the rest is of all coordinates."""
 
 
 @registry.model.register("TalkingStyle")
@@ -37,10 +37,10 @@ class TalkingStyle(OffsetModel):
 
     Args:
         num_layers: layers of the decoder.
-        mouth_loss: what the mouth is there: as published, the numbers of the lips' vertices count the ``flattened``
+        mouth_loss: the mouth's coordinates: as published, the numbers of the lips' vertices count the ``flattened``
             coordinates, x, y and z of vertex 0 first, so that other places than the mouth get the weight; or the
             ``vertices`` that are meant.
-        options: those of the other methods with this decoder, see
+        options: of the other methods with this decoder, see
             :class:`~facediff.models.published.autoregressive.AutoregressiveModel`, and of every model.
     """
 
@@ -70,13 +70,13 @@ class TalkingStyle(OffsetModel):
         return [style.first, style.second]
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """The mean squared error of all coordinates and that of the mouth."""
+        """The mean squared error of all coordinates and of the mouth."""
         predicted, truth, frames = self.predicted_and_true(batch)
         columns = self.mouth_columns()
-        whole = mean_squared_error(predicted, truth, frames)
+        face = mean_squared_error(predicted, truth, frames)
         mouth = mean_squared_error(predicted[..., columns], truth[..., columns], frames)
-        loss = (1.0 - MOUTH_SHARE) * whole + MOUTH_SHARE * mouth
-        return {"reconstruction": whole, "mouth": mouth, "loss": loss}
+        loss = (1.0 - MOUTH_SHARE) * face + MOUTH_SHARE * mouth
+        return {"reconstruction": face, "mouth": mouth, "loss": loss}
 
     def mouth_columns(self) -> Int[Tensor, " columns"]:
         """The coordinates that the loss takes for the mouth's."""
@@ -92,7 +92,7 @@ class SpeakerStyle(nn.Module):
 
     Each of the numbers of e becomes three vectors of four numbers, by which the attention has its query, key and value.
     The published attention sees each number as a sequence of length one, so that the softmax over its only key is 1
-    and query and key have no influence: what is left of it are the maps of its values.
+    and query and key have no influence: the maps of its values are left.
 
     Args:
         count: speakers.

@@ -1,9 +1,9 @@
 """UniTalker (Fan, Li, Lin, Xiao, Yang: "UniTalker: Scaling up Audio-Driven 3D Facial Animation", 2024).
 
 One network with a head for each kind of face that its eight data sets have: vertices as principal components, weights
-of ARKit's shapes, coefficients of FLAME. Here a model has one head, that of its corpus. From top to bottom: the model,
-its network, the authors' files. docs/methods.md says what of the
-published code is an option here.
+of ARKit's shapes, coefficients of FLAME. Here a model has one head, its corpus's. From top to bottom: the model,
+its network, the authors' files. docs/methods.md lists the options for
+choices of the published code.
 """
 
 from __future__ import annotations
@@ -23,15 +23,14 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError, OptionError, choices
-from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.graphs import Spoken
 from facediff.models.inference import BatchMotion, Progress, Style, with_speech
-from facediff.models.layers import Heads, Share, Width, exporting, frame_mask
+from facediff.models.layers import Heads, Share, Width, check_heads, exporting, frame_mask
 from facediff.models.published.autoregressive import PeriodicDecoder
 from facediff.models.published.base import DirectModel, SpeakerTable, masked_mean, still_map
-from facediff.models.published.cards import AuthorFiles, Facts
+from facediff.models.published.cards import AuthorFiles, Facts, identities_of
 from facediff.models.published.convolutions import ConvolutionStack
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.speech_networks import Wav2Vec2Encoder
@@ -43,7 +42,7 @@ from facediff.utils.licences import Licence
 from facediff.utils.ranges import Range
 
 COMMON = "common"
-"""The style of the last row of the table: of nobody, which training also shows to clips of the training speakers."""
+"""The style of the last row of the table: of no speaker; training also shows it to clips of the training speakers."""
 
 DecoderKind = Literal["conv", "transformer"]
 
@@ -51,10 +50,10 @@ WINDOW, OVERLAP = 25, 5
 """Seconds of a published window, and of its overlap with the next."""
 
 PERIOD = 30
-"""Frames after which the Transformer's positions and its attention's bias repeat, whatever the frame rate."""
+"""Frames after which the Transformer's positions and its attention's bias repeat, at any frame rate."""
 
 COMPONENT_WEIGHT, VALUE_WEIGHT = 0.01, 1e-4
-"""Of the squared error of principal components, and of a parametric space's values next to that of what they move."""
+"""Weights of the squared error of principal components, and of a parametric space's values."""
 
 COMMON_SHARE = 0.1
 """Share of the clips that are shown with the common style in training."""
@@ -68,17 +67,18 @@ class UniTalker(DirectModel):
 
     Args:
         dim: channels of the decoder.
-        style_dim: channels of a speaker's row, of ``conv``; those of a Transformer are ``dim``.
+        style_dim: channels of a speaker's row, of ``conv``; a Transformer's are ``dim``.
         decoder_type: ``conv``, as the released models, or ``transformer``.
         num_heads: attention heads of the Transformer.
         dropout: on the features of speech, and in the Transformer.
         components: principal components of the training motion that the head of a corpus of vertices predicts; 0 for
             the vertices themselves, as of weights.
         frozen_epochs: epochs in the beginning in which the speech network is not trained.
-        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+        options: see :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
     # WavLM base plus asks for no standardisation of its speech: the published B model hears the waveform as it is.
+    step_rule: ClassVar[StepRule] = "hidden"
     clock_rule = "rows"  # as many frames as speech lasts, rounded to even
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="microsoft/wavlm-base-plus", spec_augment=True, edges=False, do_normalize=False
@@ -98,8 +98,8 @@ class UniTalker(DirectModel):
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(unseen_identity=unseen_identity, **options)
-        if decoder_type == "transformer" and (dim % num_heads or dim % 2):
-            raise ArgumentError({"dim": dim, "num_heads": num_heads}, "dim must be even, and a multiple of heads")
+        if decoder_type == "transformer":
+            check_heads(dim=dim, num_heads=num_heads, even=True)
         self.frozen_epochs = frozen_epochs
         self.windows = type(self.windows)(above=math.inf)  # the method has windows of its own
         if components is None:
@@ -117,7 +117,7 @@ class UniTalker(DirectModel):
         )
 
     def measure(self, data: SpeechMotionDataModule, at_least: int = 0) -> Float[Tensor, "components all"] | None:
-        """The head's principal components are those of the training motion."""
+        """The head's principal components are the training motion's."""
         count = self.network.components
         principal = super().measure(data, max(at_least, count))
         if count:
@@ -131,7 +131,7 @@ class UniTalker(DirectModel):
         return faces_of(files, options)
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
         """The rows of the table and the head of one data set, and its principal components."""
         data, first, count = facts.details["data"], facts.details["first"], len(facts.identities)
         table, head = files[TABLE], f"out_head_dict.{data['head']}."
@@ -148,7 +148,7 @@ class UniTalker(DirectModel):
             files.tensors |= {"network.mean": mean, "network.basis": basis}
         kind: DecoderKind = "transformer" if "decoder.PPE.pe" in files.tensors else "conv"
         style = {} if kind == "transformer" else {"style_dim": table.shape[1]}
-        # The published B model hears the waveform as it is, the L model what is standardised.
+        # The published B model hears the waveform as it is, the L model the standardised one.
         normalised = not any("rel_attn_embed" in name for name in files.tensors)
         return {"components": components, "decoder_type": kind, "do_normalize": normalised, **style}
 
@@ -170,13 +170,6 @@ class UniTalker(DirectModel):
         names = [*self.identities, COMMON]
         return {name: Style(name, row) for name, row in zip(names, torch.eye(len(names)), strict=True)}
 
-    # Frames.
-
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
-        """Hidden states of the speech network, resampled to the frames."""
-        cached = heard.cached_features or ()
-        return self.audio_encoder.at_steps(heard.audio, heard.audio_lengths, frames, "hidden", *cached)
-
     def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
         """Offsets from the template."""
         mask = None if frames is None or exporting() else frame_mask(frames, features.shape[1])
@@ -186,16 +179,16 @@ class UniTalker(DirectModel):
     # Training and inference.
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Squared errors: of vertices and their components; of weights what they move, and a little of themselves."""
+        """Squared errors: of vertices and their components; of weights also of the vertices that they move."""
         frames = self.trained_frames(batch)
-        features = self.hear(batch, frames)
+        features = self.encode_speech(batch, frames)
         if self._trainer is not None and self.training and self.trainer.current_epoch < self.frozen_epochs:
             # Gradients of zero, and not none: every process must give every weight one.
             features = features.detach() + 0.0 * (features - features.detach())
         weights = self.identity_weights(batch)
         if self.training:
-            drawn = torch.rand(len(weights), generator=generator, device=weights.device) < COMMON_SHARE
-            weights = torch.where(drawn[:, None], self.weights_of(torch.full_like(batch.identity, -1)), weights)
+            common = torch.rand(len(weights), generator=generator, device=weights.device) < COMMON_SHARE
+            weights = torch.where(common[:, None], self.weights_of(torch.full_like(batch.identity, -1)), weights)
         mask = frame_mask(frames, features.shape[1])
         coded = self.network.head(self.network(features, weights, mask))
         shape = (*features.shape[:2], self.n_vertices, self.dims)
@@ -208,8 +201,8 @@ class UniTalker(DirectModel):
             losses["values"] = masked_mean(difference.square(), frames)
             loss = loss + VALUE_WEIGHT * losses["values"]
         if self.network.components:
-            own = self.network.coefficients(truth.flatten(2))
-            losses["components"] = masked_mean((coded - own).square(), frames)
+            coefficients = self.network.coefficients(truth.flatten(2))
+            losses["components"] = masked_mean((coded - coefficients).square(), frames)
             loss = loss + COMPONENT_WEIGHT * losses["components"]
         return {**losses, "loss": loss}
 
@@ -222,8 +215,8 @@ class UniTalker(DirectModel):
             return super().generate_frames(batch, frames, seeds=seeds, progress=progress)
         motion = batch.template.new_zeros(len(batch.audio), int(frames.max()), *batch.template.shape[1:])
         for row, count in enumerate(frames.tolist()):
-            own = self.in_windows(batch.select([row]))  # at rates such as 29.97, a frame more or less by rounding
-            motion[row, :count] = own[torch.arange(count).clamp_max(len(own) - 1)]
+            clip = self.in_windows(batch.select([row]))  # at rates such as 29.97, a frame more or less by rounding
+            motion[row, :count] = clip[torch.arange(count).clamp_max(len(clip) - 1)]
         return motion
 
     def standardised(self, batch: Batch) -> Batch:
@@ -238,7 +231,7 @@ class UniTalker(DirectModel):
         return replace(batch, audio=audio)
 
     def in_windows(self, clip: Batch) -> Float[Tensor, "frames points dims"]:
-        """Motion of one clip: windows of 25 s, over whose 5 s of overlap one goes over into the next linearly."""
+        """Motion of one clip: windows of 25 s, faded linearly over overlaps of 5 s."""
         speech = clip.audio[0, : int(clip.audio_lengths[0])]
         window, step = WINDOW * SAMPLE_RATE, (WINDOW - OVERLAP) * SAMPLE_RATE
         count = max(0, math.ceil((len(speech) / SAMPLE_RATE - WINDOW) / (WINDOW - OVERLAP))) + 1
@@ -246,13 +239,13 @@ class UniTalker(DirectModel):
         for number in range(count):
             samples = speech[number * step : number * step + window]
             piece = with_speech(clip, samples, max(1, self.frames_of(len(samples))))
-            now = super().generate_frames(piece, piece.frame_lengths, seeds=[0])[0]
+            generated = super().generate_frames(piece, piece.frame_lengths, seeds=[0])[0]
             first = round(number * (WINDOW - OVERLAP) * self.frame_rate)
-            before = motion[first : first + len(now)]
+            before = motion[first : first + len(generated)]
             # Both ends of the overlap are of one window alone, as published.
             share = torch.linspace(0, 1, len(before), dtype=torch.float64, device=speech.device).view(-1, 1, 1)
-            mixed = (1 - share) * before + share * now[: len(before)]
-            motion = torch.cat([motion[:first], mixed.to(now), now[len(before) :]])
+            mixed = (1 - share) * before + share * generated[: len(before)]
+            motion = torch.cat([motion[:first], mixed.to(generated), generated[len(before) :]])
         return motion
 
 
@@ -307,7 +300,7 @@ class UniTalkerNetwork(nn.Module):
         weights: Float[Tensor, "batch rows"],
         mask: Bool[Tensor, "batch frames"] | None = None,
     ) -> Float[Tensor, "batch frames dim"]:
-        """What the heads take; frames outside the mask have no meaning."""
+        """Inputs of the heads; frames outside the mask have no meaning."""
         style, memory = self.style(weights), self.audio_map(features)
         if self.transformer is not None:
             # Its queries are the speaker and the frame's position alone; a frame hears its own moment of the speech.
@@ -335,11 +328,11 @@ class UniTalkerNetwork(nn.Module):
 # The authors' files.
 
 TABLE, DEFAULT = "decoder.learnable_style_emb.weight", "D3"
-"""The table of speakers of all data sets, and the data set whose faces are animated by default."""
+"""The table of speakers of all data sets, and the data set of the faces to animate by default."""
 
 
 def space_of(name: str) -> Space:
-    """What the numbers of a head mean; FLAME's 413 with the 300 of the shape, which the released model predicts too."""
+    """The space of a head's numbers; FLAME's 413 with the 300 of the shape, which the released model predicts too."""
     if not name:
         return VERTICES
     layout = find_layout(name)
@@ -348,36 +341,29 @@ def space_of(name: str) -> Space:
     turns: dict[int, Any] = {rotation.start: (rotation.joint, rotation.form) for rotation in layout.space.rotations}
     inside = {channel for rotation in layout.space.rotations for channel in rotation.channels}
     parts: list[Any] = [f"shape {layout.identity}"]
-    for place, channel in enumerate(layout.space.channels):
-        if place in turns:
-            parts.append(turns[place])
-        elif place not in inside:
+    for index, channel in enumerate(layout.space.channels):
+        if index in turns:
+            parts.append(turns[index])
+        elif index not in inside:
             parts.append(channel)
     return parametric("flame", parts, version=layout.space.version)
 
 
 def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
     """The chosen data set's frame rate, speakers and neutral face."""
-    known, name = files.card.data, options.dataset or DEFAULT
-    if name not in known:
-        raise OptionError.naming(f"{{dataset}} {name}: UniTalker has no such data set: {choices(name, known)}")
-    data, rows = known[name], files.size(TABLE, 0)
+    data_sets, name = files.card.data, options.dataset or DEFAULT
+    if name not in data_sets:
+        raise OptionError.naming(f"{{dataset}} {name}: UniTalker has no such data set: {choices(name, data_sets)}")
+    data, rows = data_sets[name], files.size(TABLE, 0)
     # A checkpoint with another number of rows was trained on one data set alone.
-    alone = rows != sum(entry["speakers"] for entry in known.values()) + 1
-    count = rows - 1 if alone else data["speakers"]
-    if alone and options.identities is None:
-        raise OptionError.naming(
-            f"{files.source}: has {rows} rows of speakers, which are not those of all data sets together; give "
-            f"{{identities}} with {count} names, if it was trained on {name} alone"
-        )
-    names = list(options.identities or [f"{name}_{row}" for row in range(count)])
-    if len(names) != count:
-        raise OptionError.naming(f"{{identities}}: {len(names)} names are given, and {name} has {count} speakers")
+    single = rows != sum(entry["speakers"] for entry in data_sets.values()) + 1
+    count = rows - 1 if single else data["speakers"]
+    names = identities_of(options.identities, count, [] if single else [f"{name}_{row}" for row in range(count)])
     root, notes = options.data_root, []
     row = data.get("template_row", 0) if options.template_row is None else options.template_row
     faces = np.zeros((row + 1, data["width"]), np.float32)
     if root is not None:
-        faces = released_array(Path(root) / data["folder"] / "id_template.npy")
+        faces = np.asarray(open_array(Path(root) / data["folder"] / "id_template.npy", kinds="f"))
     elif "layout" not in data or options.template_row is not None:
         raise OptionError.naming(
             f"{{data_root}}: {files.source} holds neither the neutral faces nor the principal components of its "
@@ -402,24 +388,15 @@ def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
         notes=notes,
         details={
             "data": data,
-            "first": 0 if alone else sum(entry["speakers"] for key, entry in known.items() if key < name),
+            "first": 0 if single else sum(entry["speakers"] for key, entry in data_sets.items() if key < name),
             "root": root,
         },
     )
 
 
-def released_array(path: Path) -> np.ndarray:
-    """An array of the data release."""
-    if not path.is_file():
-        raise OptionError.naming(f"{{data_root}}: has no {path}; expected UniTalker's data release")
-    return np.asarray(open_array(path, kinds="f"))
-
-
 def components_of(root: Path, data: Mapping[str, Any], count: int) -> tuple[Tensor, Tensor]:
     """Mean and principal components of a data set's vertices."""
     path = Path(root) / data["folder"] / "pca.npz"
-    if not path.is_file():
-        raise OptionError.naming(f"{{data_root}}: has no {path}; expected UniTalker's data release")
     names = ("original_data_mean", "components_to_data")
     archive = read_arrays(path, names, remedy="download it again")
     mean, basis = (torch.from_numpy(np.asarray(archive[name], np.float32)) for name in names)

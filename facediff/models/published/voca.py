@@ -2,7 +2,7 @@
 
 Convolutions over a window of DeepSpeech's logits around each frame, joined with the speaker as a one-hot vector, give
 the coefficients of linear shapes. From top to bottom: the model, its network, the authors' checkpoint.
-docs/methods.md says what of the published code is an option here.
+docs/methods.md lists the options for choices of the published code.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import OptionError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.deepspeech import DeepSpeechEncoder, network_of
-from facediff.models.graphs import Spoken
+from facediff.models.graphs import SpeechInput
 from facediff.models.layers import Width, exporting, frame_mask, sliding
 from facediff.models.published.base import DirectModel, SpeakerTable
 from facediff.models.squared_errors import squared_errors
@@ -44,7 +44,7 @@ ENCODER, SCOPES = "SpeechEncoder/", ("SpeechEncoder/", "ExpressionLayer/")
 """How the names of the authors' variables begin."""
 
 OPTIMISER = ("/Adam", "/Adam_1", "/Momentum", "/RMSProp", "/ExponentialMovingAverage", "global_step", "_power")
-"""How names of what the optimiser keeps end."""
+"""Endings of the names of the optimiser's state."""
 
 
 @registry.model.register("Voca")
@@ -56,10 +56,10 @@ class Voca(DirectModel):
         components: linear shapes.
         channels: of the convolutions, each of which halves the window.
         speech_window: rows of speech around each frame, half of them before it.
-        velocity_weight: of the error of differences between frames, next to that of the frames.
+        velocity_weight: of the error of differences between frames, next to the error of the frames.
         shapes: how the linear shapes start: as ``principal`` components of the training motion as published, or
             ``random``.
-        options: those of :class:`~facediff.models.published.base.PublishedModel`, and of every model.
+        options: see :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
     published_encoder: ClassVar[AudioEncoderFactory] = DeepSpeechEncoder
@@ -92,7 +92,7 @@ class Voca(DirectModel):
         )
 
     @classmethod
-    def read_author(cls, files: AuthorFiles, facts: Facts, asked: Mapping[str, Any]) -> dict[str, Any]:
+    def read_author(cls, files: AuthorFiles, facts: Facts, given_options: Mapping[str, Any]) -> dict[str, Any]:
         """TensorFlow's layouts, the speaker's rows of two layers, and DeepSpeech's graph."""
         if PUBLISHED_RATE % facts.frame_rate:
             raise OptionError.naming(
@@ -110,7 +110,7 @@ class Voca(DirectModel):
             )
         state, sizes, left = network_of(graph, files.source)
         files.ignored |= dict.fromkeys(left, "not of VOCA, nor of DeepSpeech's network")
-        count, dense, heard = len(facts.identities), files[f"{ENCODER}fc1/weights"], sizes["logits"]
+        count, dense, logits = len(facts.identities), files[f"{ENCODER}fc1/weights"], sizes["logits"]
         tensors: dict[str, Tensor] = {f"audio_encoder.network.{name}": value for name, value in state.items()}
         tensors["network.norm.num_batches_tracked"] = torch.tensor(0)
         tensors["network.dense.weight"], tensors["network.late_style.weight"] = dense[:-count].T, dense[-count:]
@@ -118,8 +118,8 @@ class Voca(DirectModel):
         while (name := f"{ENCODER}conv{len(channels) + 1}/weights") in files.tensors:
             kernel, to = files.tensors.pop(name)[:, 0], f"network.convolutions.{len(channels)}."
             if not channels:  # (taps, identities, channels) as one row for each identity
-                tensors["network.early_style.weight"] = kernel[:, heard:].transpose(0, 1).flatten(1)
-                kernel = kernel[:, :heard]
+                tensors["network.early_style.weight"] = kernel[:, logits:].transpose(0, 1).flatten(1)
+                kernel = kernel[:, :logits]
             tensors[f"{to}weight"] = kernel.permute(2, 1, 0)
             tensors[f"{to}bias"] = files.tensors.pop(f"{ENCODER}conv{len(channels) + 1}/biases")
             channels.append(kernel.shape[2])
@@ -152,25 +152,27 @@ class Voca(DirectModel):
 
     def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
         """Frames of each clip for which there is speech."""
-        heard = torch.tensor([self.frames_of(int(n)) for n in batch.audio_lengths], device=batch.frame_lengths.device)
-        return torch.minimum(batch.frame_lengths, heard.clamp_min(1))
+        counts = torch.tensor([self.frames_of(int(n)) for n in batch.audio_lengths], device=batch.frame_lengths.device)
+        return torch.minimum(batch.frame_lengths, counts.clamp_min(1))
 
     @property
-    def heard_steps(self) -> int:
+    def speech_steps(self) -> int:
         """Rows of speech from one frame to the next."""
         return self.rows_per_frame
 
-    def hear(self, heard: Spoken, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames channels rows"]:
+    def encode_speech(
+        self, speech: SpeechInput, frames: Int[Tensor, " batch"]
+    ) -> Float[Tensor, "batch frames channels rows"]:
         """The window of speech around each frame; what lies before or after the speech is zero."""
-        step, rows = self.rows_per_frame, self.row_counts(heard.audio_lengths)
-        cached = heard.cached_features or ()
-        features = self.audio_encoder.at_rate(heard.audio, heard.audio_lengths, rows, self.frame_rate * step, *cached)
+        step, rows = self.rows_per_frame, self.row_counts(speech.audio_lengths)
+        cached = speech.cached_features or ()
+        features = self.audio_encoder.at_rate(speech.audio, speech.audio_lengths, rows, self.frame_rate * step, *cached)
         # Zeros of logits past the ends, as published, and not the logits of silence.
-        before, most = self.speech_window // 2, int(frames.max()) if not exporting() else features.shape[1] // step
+        before, longest = self.speech_window // 2, int(frames.max()) if not exporting() else features.shape[1] // step
         # A graph has as many rows for each frame, of which the last ones may not be valid; they are zero.
-        missing = (most - 1) * step - features.shape[1] if not exporting() else -step
-        after = max(0, missing + self.speech_window - before)
-        return sliding(F.pad(features, (0, 0, before, after)), self.speech_window, step, most)
+        padding = (longest - 1) * step - features.shape[1] if not exporting() else -step
+        after = max(0, padding + self.speech_window - before)
+        return sliding(F.pad(features, (0, 0, before, after)), self.speech_window, step, longest)
 
     def row_counts(self, samples: Int[Tensor, " batch"]) -> Int[Tensor, " batch"]:
         """Rows of speech of clips, at least one."""
@@ -210,8 +212,8 @@ class Voca(DirectModel):
         # The network is not linear in the speaker: mixing one-hot vectors at its input would be another speaker
         # altogether. So every speaker who takes part is computed and the results are mixed.
         speakers = torch.eye(weights.shape[1], device=weights.device, dtype=weights.dtype)
-        used = weights.any(0).nonzero().flatten().tolist()
-        parts = [weights[:, k, None] * self.network(windows, speakers[k].expand(len(windows), -1)) for k in used]
+        columns = weights.any(0).nonzero().flatten().tolist()
+        parts = [weights[:, k, None] * self.network(windows, speakers[k].expand(len(windows), -1)) for k in columns]
         return torch.stack(parts).sum(0)
 
     # Training and inference.
@@ -219,7 +221,7 @@ class Voca(DirectModel):
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Squared distances of vertices, and of their differences between frames."""
         frames = self.trained_frames(batch)
-        coefficients = self.coefficients(self.hear(batch, frames), self.identity_weights(batch), frames)
+        coefficients = self.coefficients(self.encode_speech(batch, frames), self.identity_weights(batch), frames)
         truth = self.scaled_truth(batch, frames)
         # Distances are sums over the three coordinates; the first frame is its own frame before, so that changes count
         # in as many frames as positions.
@@ -318,5 +320,5 @@ def padded_same(x: Float[Tensor, "*channels rows"], taps: int) -> Float[Tensor, 
     rows = x.shape[-1]
     # ⌈rows / 2⌉ results must come out. An odd zero goes behind; PyTorch's symmetric padding would put it in front and
     # shift all 16 rows by one.
-    missing = max(0, (-(-rows // 2) - 1) * 2 + taps - rows)
-    return F.pad(x, (missing // 2, missing - missing // 2))
+    padding = max(0, (-(-rows // 2) - 1) * 2 + taps - rows)
+    return F.pad(x, (padding // 2, padding - padding // 2))

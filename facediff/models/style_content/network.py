@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoder
-from facediff.models.graphs import Spoken
+from facediff.models.graphs import SpeechInput
 from facediff.models.layers import Attention, FeedForward, sliding
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.speaker_encoders import StyleEncoder
@@ -98,7 +98,7 @@ class DisentanglementNetwork(nn.Module):
         return self.content_of(batch, batch.frame_lengths, batch.motion.shape[1])
 
     def content_of(
-        self, speech: Spoken, lengths: Int[Tensor, " batch"], frames: int
+        self, speech: SpeechInput, lengths: Int[Tensor, " batch"], frames: int
     ) -> Float[Tensor, "batch frames content_dim"]:
         """Content of speech, of ``lengths`` frames each."""
         cached = speech.cached_features or ()

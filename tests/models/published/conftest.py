@@ -1,4 +1,4 @@
-"""A tiny model of each published method; a method more is one entry more, and is tested by it."""
+"""A tiny model of each published method; a new one is tested by being registered."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import torch
 
 from facediff import registry
 from facediff.models import AnimationModel
+from facediff.models.layers import Heads, Layers, Width
 from facediff.models.published.importing import save_model
+from facediff.utils.hints import options_of
 from tests.fakes.tiny import RATE, SEEN, VERTICES
 
 MEL = partial(registry.audio_encoder.mel, hidden_dim=16, num_layers=1, dropout=0.0)
@@ -31,49 +33,38 @@ TEXT: dict[str, Any] = {
 }
 """A tiny speech recogniser of random weights."""
 
+SMALL: list[tuple[str, object, int]] = [("dim", Width, 16), ("layers", Layers, 1), ("heads", Heads, 2)]
+"""Sizes of tiny networks by the ends of their options' names and their types."""
+
+EXTRA: dict[str, dict[str, Any]] = {
+    "CodeTalker": {"tokens": 2, "token_dim": None, "codes": 8},
+    "EmoTalk": {"emotion_config": TEXT, "emotion_dim": 4, "level_dim": 2, "person_dim": 2},
+    "FaceDiffuser": {"diffusion_steps": 8},
+    # So that the lip reader's terms count in whatever is tested.
+    "SelfTalk": {"text_config": TEXT, "consistency_weight": 1.0, "ctc_weight": 1.0},
+    "DiffSpeaker": {"sampling_steps": 8, "smooth": True},
+    "Voca": {"components": 8, "channels": (8, 8)},
+    "DiffPoseTalk": {"num_layers": 2, "window_frames": 12, "context": 3, "diffusion_steps": 4, "dropout": 0.0},
+    "ARTalk": {"scales": (1, 3, 12), "code_dim": 4},
+    "UniTalker": {"components": 0},
+}
+"""Options that follow from no name and type."""
+
+
+def tiny(name: str) -> dict[str, Any]:
+    """Options by which a published method is small: every width, number of layers and number of heads."""
+    options: dict[str, Any] = {"audio_encoder": MEL, "audio_dim": 16}
+    for option, parameter in options_of(registry.model.get(name)).items():
+        for end, hint, size in SMALL:
+            if option.endswith(end) and parameter.annotation in (hint, hint | None):
+                options[option] = size
+    return options | EXTRA.get(name, {})
+
+
 METHODS: dict[str, dict[str, Any]] = {
-    "FaceFormer": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16},
-    "CodeTalker": {
-        **{"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 1, "prior_dim": 16, "prior_layers": 1},
-        **{"prior_heads": 2, "prior_feed_forward_dim": 24, "tokens": 2, "codes": 8},
-    },
-    "EmoTalk": {
-        **{"audio_encoder": MEL, "emotion_config": TEXT, "audio_dim": 16, "dim": 16},
-        **{"emotion_dim": 4, "level_dim": 2, "person_dim": 2},
-    },
-    "FaceDiffuser": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "diffusion_steps": 8},
-    "SelfTalk": {
-        "audio_encoder": MEL,
-        "audio_dim": 16,
-        "dim": 16,
-        "text_config": TEXT,
-        "lip_layers": 1,
-        "lip_feed_forward_dim": 16,
-        # So that the lip reader's terms count in whatever is tested.
-        "consistency_weight": 1.0,
-        "ctc_weight": 1.0,
-    },
-    "TalkingStyle": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 1},
-    "DiffSpeaker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "sampling_steps": 8, "smooth": True},
-    "Voca": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "components": 8, "channels": (8, 8)},
-    "LamAudio2Expression": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "identity_dim": 4},
-    "DiffPoseTalk": {
-        **{"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 2, "num_heads": 2, "style_dim": 8},
-        **{
-            "style_layers": 1,
-            "style_heads": 2,
-            "window_frames": 12,
-            "context": 3,
-            "diffusion_steps": 4,
-            "dropout": 0.0,
-        },
-    },
-    "ARTalk": {
-        **{"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "num_layers": 1, "num_heads": 2, "scales": (1, 3, 12)},
-        **{"code_dim": 4, "codec_dim": 8, "codec_layers": 1, "codec_heads": 2, "style_dim": 8, "style_layers": 1},
-        **{"style_heads": 2},
-    },
-    "UniTalker": {"audio_encoder": MEL, "audio_dim": 16, "dim": 16, "style_dim": 4, "components": 0},
+    entry.name: tiny(entry.name)
+    for entry in registry.model
+    if entry.implementation.__module__.startswith("facediff.models.published.")
 }
 """Options by which each published method is small."""
 

@@ -108,7 +108,7 @@ def test_tokens_are_drawn_to_codes_by_a_quarter_of_what_codes_are_drawn_by(tmp_p
     table = prior.prior.codebook
     to_tokens, to_codes = torch.autograd.grad(prior.losses(batch)["quantisation"], (tokens, table))
     codes = prior.prior.quantise(tokens)
-    error = 2 * (tokens - codes.chosen) / tokens.numel()
+    error = 2 * (tokens - codes.entries) / tokens.numel()
     torch.testing.assert_close(to_tokens, 0.25 * error)
     moved = torch.zeros_like(table).index_add_(0, codes.numbers.flatten(), -error.reshape(-1, table.shape[1]))
     torch.testing.assert_close(to_codes, moved)
@@ -309,7 +309,7 @@ def test_the_stages_come_in_any_order_and_an_inner_prior_wins(tmp_path: Path) ->
             model_options={"prior_heads": 2},
         ),
     )
-    assert "quantize.embedding.weight" in made.ignored
+    assert "quantize.embedding.weight" in made.files.ignored
 
 
 def test_a_predictor_can_be_trained_on_an_authors_prior(tmp_path: Path) -> None:

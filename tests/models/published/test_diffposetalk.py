@@ -11,15 +11,13 @@ import torch
 from torch import Tensor
 
 from facediff.data import Reference
-from facediff.errors import FaceDiffError
-from facediff.models import AnimationModel, import_checkpoint, load_model
+from facediff.models import AnimationModel, import_checkpoint
 from facediff.models.graphs import update_table
 from facediff.models.inference import Style
 from facediff.models.published.clip_style import ClipStyleEncoder, style_contrast
 from facediff.models.published.diffposetalk import DiffPoseTalk, fitted
 from facediff.models.published.diffposetalk_network import CosineProcess
 from facediff.models.published.diffusion import PosteriorSampler
-from facediff.models.published.importing import save_model
 from tests.fakes import published_parameters as author
 from tests.fakes.published import AUDIO_CONFIG
 
@@ -244,19 +242,3 @@ def test_style_of_a_padded_clip_is_its_own() -> None:
     with torch.no_grad():
         alone, padded = encoder(clip), encoder(torch.nn.functional.pad(clip, (0, 0, 0, 5), value=3.0), mask)
     torch.testing.assert_close(padded, alone, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("option", [{"identities": ["A"]}, {"regions": Path()}, {"dataset": "biwi"}], ids=str)
-def test_options_without_effect_are_refused(option: dict[str, Any], tmp_path: Path) -> None:
-    files = author.write_diffposetalk(tmp_path, head=False)
-    with pytest.raises(FaceDiffError, match=rf"^{next(iter(option))}: DiffPoseTalk does not read .*omit it"):
-        import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=author.statistics(), **option)
-
-
-def test_statistics_of_a_checkpoint_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    save_model(imported(tmp_path), tmp_path / "model.ckpt")
-    content = torch.load(tmp_path / "model.ckpt", weights_only=True)
-    content["state_dict"]["motion_mean"][3] = torch.nan
-    torch.save(content, tmp_path / "model.ckpt")
-    with pytest.raises(FaceDiffError, match="motion_mean' hold NaN"):
-        load_model(tmp_path / "model.ckpt")

@@ -198,5 +198,5 @@ def test_what_is_not_needed_is_reported(tmp_path: Path) -> None:
             dataset="biwi", identities=IDENTITIES, templates=templates(), audio_config=published.AUDIO_CONFIG
         ),
     )
-    assert set(made.ignored) == {"denoiser.PPE.pe", "_losses.total"}
+    assert set(made.files.ignored) == {"denoiser.PPE.pe", "_losses.total"}
     assert any(licence.commercial == "unknown" for licence in made.model.licences)

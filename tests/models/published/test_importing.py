@@ -145,7 +145,7 @@ def test_the_doctor_prints_every_difference_and_writes_nothing(
 def test_tensors_may_be_left_out_and_are_reported(tmp_path: Path) -> None:
     path = write_author_files(tmp_path, lambda s: s.update({"extra.a": torch.ones(2), "extra.b": torch.ones(2)}))
     options = ImportOptions(**given(tmp_path), model_options={"ignore": "extra."})
-    assert import_files(path, options).ignored.keys() == {"extra.a", "extra.b", "PPE.pe"}
+    assert import_files(path, options).files.ignored.keys() == {"extra.a", "extra.b", "PPE.pe"}
 
 
 def test_options_come_from_one_file_too(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
 from facediff.models import LamAudio2Expression, import_checkpoint
-from facediff.models.published.lam_finishing import CONTEXT_FRAMES, Finishing, damp_mouth, loudness
+from facediff.models.published.lam_postprocessing import CONTEXT_FRAMES, Postprocessing, damp_mouth, loudness
 from facediff.spaces.layouts import layout
 from tests.models.published.conftest import MEL, TEXT
 
@@ -183,7 +183,7 @@ def test_loudness_is_the_root_mean_square_around_the_begin_of_a_frame() -> None:
 def test_silence_damps_the_mouth_alone() -> None:
     values, volume = weights(30), np.ones(30, np.float32)
     volume[10:20] = 0
-    mouth = Finishing.of("mouth", SPACE, 30.0).start(0).mouth
+    mouth = Postprocessing.of("mouth", SPACE, 30.0).start(0).mouth
     damped = damp_mouth(values.copy(), volume, mouth)
     np.testing.assert_allclose(damped[13:17, mouth], 0.1 * values[13:17, mouth], rtol=1e-6)
     others = sorted({*range(52)} - {*mouth})
@@ -199,7 +199,7 @@ def test_silence_damps_the_mouth_alone() -> None:
 @pytest.mark.parametrize(("step", "sideways"), [("symmetric", True), ("halves", False)])
 def test_left_and_right_are_averaged(step: str, sideways: bool) -> None:
     values = weights(5)
-    finished = Finishing.of(step, SPACE, 30.0).start(0).whole(values, speech_of(2500).numpy())
+    finished = Postprocessing.of(step, SPACE, 30.0).start(0).whole(values, speech_of(2500).numpy())
     for left, right, averaged in (("mouthSmileLeft", "mouthSmileRight", True), ("jawLeft", "jawRight", sideways)):
         pair = [SPACE.index(left), SPACE.index(right)]
         expected = values[:, pair].mean(1, keepdims=True).repeat(2, 1) if averaged else values[:, pair]
@@ -207,7 +207,7 @@ def test_left_and_right_are_averaged(step: str, sideways: bool) -> None:
 
 
 def test_blinks_follow_numpys_seed() -> None:
-    finished = Finishing.of("blinks", SPACE, 30.0).start(7).whole(weights(20), speech_of(10_500).numpy())
+    finished = Postprocessing.of("blinks", SPACE, 30.0).start(7).whole(weights(20), speech_of(10_500).numpy())
     np.random.seed(7)  # noqa: NPY002 - what the published code draws from
     scale, row = np.random.uniform(0.8, 1.0), np.random.randint(0, 4)  # noqa: NPY002
     lids = finished[:, [8, 9]]
@@ -218,9 +218,9 @@ def test_blinks_follow_numpys_seed() -> None:
 def test_a_parabola_is_left_as_it_is_and_a_stream_leads_away_from_what_was_given() -> None:
     time = np.arange(20)[:, None] / 20
     parabola = (0.2 + 0.5 * time * (1 - time)).repeat(52, 1).astype(np.float32)
-    finished = Finishing.of("smooth", SPACE, 30.0).start(0).whole(parabola, speech_of(10_600).numpy())
+    finished = Postprocessing.of("smooth", SPACE, 30.0).start(0).whole(parabola, speech_of(10_600).numpy())
     np.testing.assert_allclose(finished[2:-2], parabola[2:-2], atol=1e-6)
-    finish = Finishing.of("smooth", SPACE, 30.0).start(0)
+    finish = Postprocessing.of("smooth", SPACE, 30.0).start(0)
     one = finish.chunk(np.full((30, 52), 0.8, np.float32), speech_of(16_000).numpy())
     other = finish.chunk(np.full((30, 52), 0.2, np.float32), speech_of(16_000).numpy())
     assert one[0, 0] < 0.5  # from rest

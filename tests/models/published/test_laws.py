@@ -98,7 +98,7 @@ def test_animation_has_the_methods_own_frames_and_face_and_condition_are_indepen
     # Where absolute vertices are noised, the face itself takes part in what the noise becomes.
     model = with_assets(make_method(method, **({"noised": "offsets"} if method == "FaceDiffuser" else {})))
     speech = 0.1 * torch.randn(16_137, generator=torch.Generator().manual_seed(2))
-    assert model.hears_all
+    assert model.counts_own_frames
     templates = model.assets.templates
     one = model.animate(speech, identity=UNSEEN, condition="B")
     other = model.animate(speech, identity="B")

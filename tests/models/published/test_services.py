@@ -90,7 +90,7 @@ def test_kept_speech_features_change_no_loss(
     for callbacks in ([], [SpeechFeatureCache(str(tmp_path))], [SpeechFeatureCache(str(tmp_path))]):
         seed_everything(1, verbose=False)
         model, clips, losses = make_method(method, **SPEECH), [], Losses()
-        if callbacks and not model.hears_whole_clips:
+        if callbacks and not model.encodes_whole_clips:
             with pytest.raises(FaceDiffError, match=f"SpeechFeatureCache: {method}"):
                 make_trainer(callbacks=callbacks).fit(model, datamodule=tiny)
             return

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from facediff.data import collate
-from facediff.errors import FaceDiffError
 from facediff.models import TalkingStyle
 from tests.fakes import published
 from tests.fakes.published import IDENTITIES, VERTICES
@@ -36,13 +35,6 @@ def test_frames_are_counted_in_floating_point(dataset: str, steps: int, frames: 
     expected = published.talkingstyle_offsets(state, speech_of(steps), dataset, 2) + face("C")
     assert len(made) == frames
     torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
-
-
-def test_the_style_is_an_attention_of_each_component_to_itself(tmp_path: Path) -> None:
-    state = published.talkingstyle_state("vocaset")
-    model = imported(state, tmp_path, "vocaset")
-    expected = torch.stack([published.talkingstyle_style(state, i) for i in range(3)])
-    torch.testing.assert_close(model.network.style(torch.eye(3)), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("mouth", ["flattened", "vertices"])
@@ -77,9 +69,3 @@ def test_teacher_forcing_in_one_pass(tmp_path: Path) -> None:
     made = published.decoded(tokens + state["PPE.pe"][0, :24], memory, state, "transformer_decoder.", "vocaset")
     expected = (published.linear(made, state, "vertice_decoder") - truth.flatten(1)).square().mean()
     torch.testing.assert_close(loss, expected, rtol=1e-4, atol=1e-6)
-
-
-def test_speech_beyond_the_table_is_refused(tmp_path: Path) -> None:
-    model = imported(published.talkingstyle_state("vocaset"), tmp_path, "vocaset")
-    with pytest.raises(FaceDiffError, match="600"):
-        model.animate(torch.zeros(16_000 * 21), identity="A")

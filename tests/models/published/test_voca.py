@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Trainer
-from torch import Tensor
 
 from facediff.cli.app import main
 from facediff.data import collate
@@ -26,16 +25,10 @@ from facediff.models.styles import read_styles
 from tests.fakes import voca
 from tests.fakes.tiny import Tiny
 from tests.fakes.voca import IDENTITIES, VERTICES, write_arrays, write_voca
+from tests.models.published.test_lam import speech_of
 from tests.models.published.test_laws import clips, with_assets
 
 Make = Callable[..., Any]
-
-
-def speech_of(samples: int) -> Tensor:
-    """Speech as a file of 16 bits holds it, but for a part of a step, which is cut off."""
-    time = np.arange(samples) / 16_000
-    noise = np.random.default_rng(samples).normal(size=samples)
-    return torch.from_numpy((0.3 * np.sin(1300 * time) * np.sin(9 * time) + 0.02 * noise).astype(np.float32))
 
 
 def templates() -> dict[str, np.ndarray]:
@@ -208,5 +201,5 @@ def test_what_is_not_needed_is_reported(tmp_path: Path) -> None:
     state = voca.deepspeech_state() | {"other/table": np.ones(3, np.float32)}
     write_arrays(files[1], state)
     made = import_files(files, ImportOptions(dataset="vocaset", identities=IDENTITIES, templates=templates()))
-    assert "other/table" in made.ignored
-    assert "SpeechEncoder/conv1/weights/Adam_1" in made.ignored
+    assert "other/table" in made.files.ignored
+    assert "SpeechEncoder/conv1/weights/Adam_1" in made.files.ignored

@@ -1,7 +1,7 @@
 """What LAM-Audio2Expression's published code does with weights after its network: all of it is optional.
 
 The mouth is damped where there is silence, weights are smoothed by a Savitzky-Golay filter, left and right are
-averaged, and eyes blink at random. Random numbers are those of NumPy's old generator, so that a seed gives what
+averaged, and eyes blink at random. Random numbers come from NumPy's old generator, so that a seed gives what
 ``numpy.random.seed`` gives there. Its random movements of the brows are not here: they are captured curves.
 """
 
@@ -40,24 +40,16 @@ BLINKS = np.array(
 """The published courses of a lid over seven frames."""
 
 
-def read_steps(text: str, known: Sequence[str], space: Space) -> frozenset[str]:
-    """Steps after a network by their names, joined by ``+``.
-
-    Args:
-        text: what was asked for; nothing if empty.
-        known: the method's steps.
-        space: of the motion.
-    """
+def read_steps(text: str, names: Sequence[str], space: Space) -> frozenset[str]:
+    """Steps after a network by their names, joined by ``+``."""
     steps = frozenset(filter(None, text.split("+")))
-    if odd := sorted(steps - set(known)):
-        raise ArgumentError({"finish": text}, f"there is no step {odd[0]}; choose from {', '.join(known)}")
-    if steps and space.kind != "arkit":
-        raise ArgumentError({"finish": text}, "is for the channels of ARKit; leave it out")
+    if steps - set(names) or (steps and space.kind != "arkit"):
+        raise ArgumentError({"finish": text}, f"expected {', '.join(names)}, joined by +, for channels of ARKit alone")
     return steps
 
 
 @dataclass(frozen=True)
-class Finishing:
+class Postprocessing:
     """Which steps are done, with the channels that they need.
 
     Attributes:
@@ -71,29 +63,29 @@ class Finishing:
     frame_rate: float
 
     @classmethod
-    def of(cls, text: str, space: Space, frame_rate: float) -> Finishing:
+    def of(cls, text: str, space: Space, frame_rate: float) -> Postprocessing:
         """Steps by their names, as :func:`read_steps` takes them."""
         return cls(read_steps(text, STEPS, space), space, frame_rate)
 
-    def start(self, seed: int) -> Finish:
-        """Finish one recording."""
-        return Finish(self, np.random.RandomState(seed % 2**32))
+    def start(self, seed: int) -> PostprocessedRecording:
+        """Process one recording."""
+        return PostprocessedRecording(self, np.random.RandomState(seed % 2**32))
 
     def indices(self, *beginnings: str) -> list[int]:
-        """The channels whose names begin so."""
-        return [place for place, name in enumerate(self.space.channels) if name.startswith(beginnings)]
+        """The channels with this prefix."""
+        return [index for index, name in enumerate(self.space.channels) if name.startswith(beginnings)]
 
 
 @dataclass
-class Finish:
+class PostprocessedRecording:
     """The state of one recording: random numbers, and the last frames of a stream.
 
     Attributes:
-        plan: what is done.
+        plan: the steps.
         random: source of the random numbers.
     """
 
-    plan: Finishing
+    plan: Postprocessing
     random: np.random.RandomState
     _values: Values = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     _volume: Values = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -114,23 +106,23 @@ class Finish:
         return values
 
     def chunk(self, values: Values, speech: Values) -> Values:
-        """The weights of the next chunk of a stream, which continue those of the chunks before it."""
+        """The weights of the next chunk of a stream, which continue the chunks before it."""
         if not self.plan.steps:
             return values
-        steps, done = self.plan.steps, len(self._values)
+        steps, start = self.plan.steps, len(self._values)
         volume = np.concatenate([self._volume, loudness(speech, self.plan.frame_rate)])
-        both = np.concatenate([self._values, values]) if done else values.copy()
+        joined = np.concatenate([self._values, values]) if start else values.copy()
         if "mouth" in steps:
-            both = damp_mouth(both, volume, self.mouth, done)
+            joined = damp_mouth(joined, volume, self.mouth, start)
         if "smooth" in steps:
-            both = smooth(join(both, done))
+            joined = smooth(join(joined, start))
         if steps & {"symmetric", "halves"}:
-            both = symmetric(both, self.plan.space, sideways="symmetric" in steps)
+            joined = symmetric(joined, self.plan.space, sideways="symmetric" in steps)
         if "blinks" in steps:
-            both = blink_on(both, self.lids, self.random, done)
-        new = both[done:]
+            joined = blink_on(joined, self.lids, self.random, start)
+        new = joined[start:]
         # The frames that were given out before are kept as they were, not as the steps have changed them now.
-        self._values = np.concatenate([self._values, new])[-CONTEXT_FRAMES:] if done else new.copy()
+        self._values = np.concatenate([self._values, new])[-CONTEXT_FRAMES:] if start else new.copy()
         self._volume = volume[-CONTEXT_FRAMES:]
         return new
 
@@ -166,7 +158,7 @@ def silent_runs(volume: Values, least: int = 7) -> list[npt.NDArray[np.intp]]:
     return [run for number, run in enumerate(runs) if len(run) >= least + (number == 0)]
 
 
-def damp_mouth(values: Values, volume: Values, mouth: list[int], done: int = 0) -> Values:
+def damp_mouth(values: Values, volume: Values, mouth: list[int], start: int = 0) -> Values:
     """The mouth nearly still in silence, with three frames of transition at either end."""
     for run in silent_runs(volume):
         first, last = int(run[0]), int(run[-1])
@@ -174,7 +166,7 @@ def damp_mouth(values: Values, volume: Values, mouth: list[int], done: int = 0) 
             continue
         values[first : last + 1, mouth] *= np.float32(DAMPED)
         # As published, frames move towards the neighbour less the farther they are from it, in all channels.
-        edges = (first - 1, first, 1, min(3, first - done)), (last + 1, last, -1, min(3, len(values) - last - 1))
+        edges = (first - 1, first, 1, min(3, first - start)), (last + 1, last, -1, min(3, len(values) - last - 1))
         for neighbour, edge, step, count in edges:
             if count <= 0:
                 continue
@@ -186,18 +178,18 @@ def damp_mouth(values: Values, volume: Values, mouth: list[int], done: int = 0) 
     return values
 
 
-def join(values: Values, done: int) -> Values:
+def join(values: Values, start: int) -> Values:
     """Lead the new frames away from the last one that is done, over five frames, or from rest over three."""
-    length = min(5 if done else 3, len(values) - done)
-    last = values[done - 1].copy() if done else np.zeros_like(values[0])
+    length = min(5 if start else 3, len(values) - start)
+    last = values[start - 1].copy() if start else np.zeros_like(values[0])
     for offset in range(length):
         share = (offset + 1) / (length + 1)
-        values[done + offset] = last * (1 - share) + values[done + offset] * share
+        values[start + offset] = last * (1 - share) + values[start + offset] * share
     return values
 
 
 def smooth(values: Values) -> Values:
-    """A parabola through five frames each, mirrored at the ends, and what it gives between 0 and 1."""
+    """A parabola through five frames each, mirrored at the ends, clipped to 0 … 1."""
     from scipy.signal import savgol_filter
 
     if len(values) < 5:  # fewer frames than the filter has
@@ -213,9 +205,9 @@ def symmetric(values: Values, space: Space, *, sideways: bool) -> Values:
     """
     result = values.copy()
     for left, name in enumerate(space.channels):
-        other = name.removesuffix("Left") + "Right"
-        if name.endswith("Left") and other in space.channels and (sideways or name not in SIDEWAYS):
-            pair = [left, space.index(other)]
+        partner = name.removesuffix("Left") + "Right"
+        if name.endswith("Left") and partner in space.channels and (sideways or name not in SIDEWAYS):
+            pair = [left, space.index(partner)]
             result[:, pair] = ((values[:, pair[0]] + values[:, pair[1]]) / 2)[:, None]
     return result
 
@@ -236,21 +228,21 @@ def blink(values: Values, lids: list[int], random: np.random.RandomState) -> Val
     return values
 
 
-def blink_on(values: Values, lids: list[int], random: np.random.RandomState, done: int) -> Values:
+def blink_on(values: Values, lids: list[int], random: np.random.RandomState, start: int) -> Values:
     """At most two blinks in the new frames of a stream, which otherwise keep the lids' motion."""
-    length, left = BLINKS.shape[1], len(values) - done
+    length, left = BLINKS.shape[1], len(values) - start
     if left <= length or not lids:
         return values
-    closed = np.flatnonzero(values[:done, lids[0]] > 0.5)
-    last = int(closed[-1]) - length if len(closed) else done
+    closed = np.flatnonzero(values[:start, lids[0]] > 0.5)
+    last = int(closed[-1]) - length if len(closed) else start
     # A place among the frames that are done is subtracted from an interval, as published.
     first = max(0, int(random.randint(40, 100)) - last)
     if first > left - length:
         return values
     course = BLINKS[random.randint(0, 4)]
     course = course * random.uniform(0.8, 1.0)
-    end = done + first + length
-    values[done + first : end, lids] = course[:, None]
+    end = start + first + length
+    values[start + first : end, lids] = course[:, None]
     after = len(values) - end
     if after > 40:
         strength, interval = random.uniform(0.8, 1.0), int(random.randint(40, 100))
