@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator, Mapping, Sequence
+import secrets
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +27,7 @@ from facediff.mesh.flame import rotations
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.space import metres_per_unit as metres_per_unit
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.files import reserve_room
 from facediff.utils.hints import check_number
 from facediff.utils.lazy import late
 from facediff.utils.limits import COORDINATE, FRAME_RATES, SAMPLE_RATES, in_range
@@ -202,13 +206,9 @@ class Animation:
         still = replace(self, vertices=without_head(self.vertices, self.head), head=None)
         return still if self.values is None else still.made_of(self.space, self.values, self.deltas)
 
-    def stretches(self) -> Iterator[tuple[slice, npt.NDArray[np.float32]]]:
-        """Stretches of consecutive frames with their vertices; see :func:`stretches_of`."""
-        return stretches_of(self.vertices)
-
     def frames(self) -> Iterator[npt.NDArray[np.float32]]:
-        """Frame after frame (V, 3); the pages of a memory map that have been read are released."""
-        for _, vertices in self.stretches():
+        """Frame after frame (V, 3)."""
+        for _, vertices in stretches_of(self.vertices):
             yield from vertices
 
     def refuse_not_finite(self) -> None:
@@ -221,8 +221,9 @@ class Animation:
         """The speech (S,) as long as the motion: cut, or padded with silence; None for a silent animation."""
         if self.speech is None:
             return None
-        wanted = round(self.seconds * self.sample_rate)
-        return np.pad(self.speech[:wanted], (0, max(0, wanted - len(self.speech)))).astype(np.float32)
+        samples = round(self.seconds * self.sample_rate)
+        speech = self.speech[:samples].astype(np.float32, copy=False)
+        return speech if len(speech) == samples else np.pad(speech, (0, samples - len(speech)))
 
     @with_options(ExportOptions, ExportKeywords)
     def save(self, path: str | Path, **options: Unpack[ExportKeywords]) -> list[Path]:
@@ -349,26 +350,85 @@ class Animation:
         return f'Animation("{self.name}": {", ".join(facts)})'
 
 
-def stretches_of(motion: npt.NDArray[np.float32]) -> Iterator[tuple[slice, npt.NDArray[np.float32]]]:
-    """Stretches of a motion (T, points, dims), and which frames they are; all of it at once where it is in memory.
+class MotionMap(np.memmap):  # type: ignore[type-arg]
+    """Motion in a file that takes little memory, however long it is: pages that were read or written are given back.
 
-    The pages of a memory map that have been read are released, so that a file of any size takes little memory.
+    Its items are plain views of the file.
     """
-    if not isinstance(motion, np.memmap):
-        yield slice(0, len(motion)), motion
-        return
-    step = max(1, MAPPED_BYTES // max(1, motion[0].nbytes))
+
+    _touched = 0
+
+    def __getitem__(self, index: Any) -> Any:  # noqa: ANN401 - as of an array
+        item = super().__getitem__(index)
+        self._release(getattr(item, "nbytes", 0))
+        return np.asarray(item) if isinstance(item, np.ndarray) else item
+
+    def __setitem__(self, index: Any, value: Any) -> None:  # noqa: ANN401 - as of an array
+        super().__setitem__(index, value)
+        self._release(getattr(value, "nbytes", 0))
+
+    def _release(self, count: int) -> None:
+        self._touched += count
+        if self._touched > MAPPED_BYTES and self._mmap is not None and hasattr(mmap, "MADV_DONTNEED"):
+            self._touched = 0
+            self._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+
+
+def stretches_of(motion: npt.NDArray[np.float32]) -> Iterator[tuple[slice, npt.NDArray[np.float32]]]:
+    """Stretches of a motion (T, points, dims), and which frames they are; all of it at once where it is in memory."""
+    step = len(motion)
+    if isinstance(motion, np.memmap):
+        # Whole stretches of 32 frames, as pages pack them.
+        step = max(1, MAPPED_BYTES // (32 * max(1, motion[0].nbytes))) * 32
     for start in range(0, len(motion), step):
         frames = slice(start, min(start + step, len(motion)))
         yield frames, motion[frames]
-        if motion.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
-            motion._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+
+
+def measured(
+    motion: npt.NDArray[np.float32], measure: Callable[[npt.NDArray[np.float32]], npt.NDArray[np.floating]]
+) -> npt.NDArray[np.floating]:
+    """Numbers (T, …) of all frames of a motion, from a function of some of them (n, points, dims)."""
+    return np.concatenate([measure(vertices) for _, vertices in stretches_of(motion)])
 
 
 def without_head(vertices: npt.NDArray[np.float32], head: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     """Vertices (T, V, 3), moved by ``head`` (T, 6) as :attr:`Animation.head` has it, as they were before."""
-    still = np.empty(vertices.shape, np.float32)
+    still = allocate_like(vertices)
     turns = rotations(head[:, :3])
     for index, frame in enumerate(vertices):
         still[index] = (frame - head[index, 3:]) @ turns[index] if head[index].any() else frame
     return still
+
+
+def allocate_like(vertices: npt.NDArray[np.float32], shape: tuple[int, ...] | None = None) -> npt.NDArray[np.float32]:
+    """An array to write to, of the same shape or another: in memory, or on disk where the vertices are a memory map.
+
+    A file on disk lies next to the map's, or where temporary files go if that folder cannot be written, and vanishes
+    with the array.
+    """
+    shape = shape or vertices.shape
+    if not isinstance(vertices, np.memmap):
+        return np.empty(shape, np.float32)
+    temporary = Path(tempfile.gettempdir())
+    folder = temporary if vertices.filename is None else Path(vertices.filename).parent
+    name = f".facediff-{secrets.token_hex(8)}.partial"
+    try:
+        path = folder / name
+        room = _mapped(path, shape)
+    except OSError:
+        path = temporary / name
+        room = _mapped(path, shape)
+    with suppress(OSError):  # Windows keeps a file that is in use
+        path.unlink()
+    return room
+
+
+def _mapped(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    array = MotionMap(path, np.float32, "w+", shape=shape)
+    try:
+        reserve_room(path)
+    except OSError:
+        path.unlink()
+        raise
+    return array

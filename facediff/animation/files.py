@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import IO, Any, TypedDict, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation.animation import Animation, Channels
+from facediff.animation.animation import Animation, Channels, MotionMap, stretches_of
 from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays
@@ -82,7 +83,8 @@ def read_animation(
     if path.suffix != ".npy":
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in .npz or .npy')
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused before it is used
-        vertices = open_vertices(path).astype(np.float32, copy=False)
+        stored = open_vertices(path)
+        vertices = stored.view(MotionMap) if stored.dtype == np.float32 else stored.astype(np.float32)
     facts = complete(overrides, defaults)
     if "frame_rate" not in facts:
         raise OptionError.naming(f"{path}: an array has no frame rate; give {{frame_rate}} or {{checkpoint}}")
@@ -143,8 +145,16 @@ def write_archive(path: Path, animation: Animation) -> None:
         **space,
     }
     arrays["about"] = np.array(json_text(path, about, indent=None))
-    with atomic(path) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **arrays)
+    with atomic(path) as temporary, zipfile.ZipFile(temporary, "w", allowZip64=True) as archive:
+        for name, array in arrays.items():
+            # As numpy.savez does, but for a motion in a file, which is never read as a whole.
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                if isinstance(array, MotionMap):
+                    write_header(stream, array.shape)
+                    for _, vertices in stretches_of(array):
+                        stream.write(np.ascontiguousarray(vertices, "<f4").tobytes())
+                else:
+                    np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
 
 
 def read_archive(path: Path) -> Animation:
@@ -226,7 +236,7 @@ class MotionWriter:
         self.frame = frame
         self.frames = 0  # written so far
         self._stream = path.open("wb")
-        self._write_header()
+        write_header(self._stream, (0, *frame))
 
     def write(self, vertices: npt.NDArray[np.float32]) -> None:
         """Add frames (n, V, 3)."""
@@ -237,9 +247,9 @@ class MotionWriter:
         """Write the number of frames into the header."""
         with self._stream:
             self._stream.seek(0)
-            self._write_header()
+            write_header(self._stream, (self.frames, *self.frame))
 
-    def _write_header(self) -> None:
-        # NumPy leaves room for the first number of a shape to grow, so that the header may be overwritten in its place.
-        facts = {"descr": "<f4", "fortran_order": False, "shape": (self.frames, *self.frame)}
-        np.lib.format.write_array_header_1_0(self._stream, facts)
+
+def write_header(stream: IO[bytes], shape: tuple[int, ...]) -> None:
+    """The beginning of a .npy file of float32, which may be overwritten: NumPy leaves room for more frames."""
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})

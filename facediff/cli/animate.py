@@ -162,7 +162,7 @@ def animate_recording(
     pipeline = open_pipeline(options)
     weights = seeks_weights(output, files) and pipeline.has_weights
     check_export(output, files, options.samples, weights=weights)
-    seconds, size = pipeline.cost(recording.speech, output, files.size)
+    seconds, size = pipeline.cost(recording.seconds, output, files.size)
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
     written, animation = pipeline.write(recording, output, files)
     metadata = animation.metadata

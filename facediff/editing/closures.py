@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from facediff.animation import Animation
-from facediff.animation.animation import metres_per_unit
+from facediff.animation.animation import measured, metres_per_unit
 from facediff.editing.expressiveness import ALL, region_factors
 from facediff.editing.eyelids import Array
 from facediff.editing.procedural import EDITED, copied, with_metadata
@@ -47,7 +47,10 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     metre = 1 / metres_per_unit(animation.unit)
     rest = np.asarray(animation.template, np.float64)
     still = rest[upper] - rest[lower]
-    gaps = np.asarray(animation.vertices[:, upper], np.float64) - animation.vertices[:, lower] - still
+    gaps = measured(
+        animation.vertices,
+        lambda vertices: np.asarray(vertices[:, upper], np.float64) - vertices[:, lower] - still,
+    )
     apart = np.linalg.norm(gaps, axis=-1).mean(1)
     # The widest fifth of the frames gives the direction in which lips part: at rest, gaps have none.
     widest = gaps[apart >= np.quantile(apart, 0.8)].mean(0)

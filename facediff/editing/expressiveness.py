@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.animation import allocate_like
 from facediff.animation.options import Scales, scales_text
 from facediff.editing.eyelids import Array, Eyes, Indices
-from facediff.editing.procedural import EDITED, allocate_like, in_words, with_metadata
+from facediff.editing.procedural import EDITED, in_words, with_metadata
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.utils.hints import Range, read
 from facediff.utils.numerics import nearest_distances, smooth_step

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.animation import measured
 from facediff.editing.correspondence import LIDS_AT_REST, Correspondence
 from facediff.editing.face_features import Features, FrontView
 from facediff.editing.lid_transfer import LidEdges, eyeball_depth, eyeball_triangles, lid_edges
@@ -147,7 +149,7 @@ def fullest_blink(animation: Animation, edges: list[LidEdges]) -> tuple[int, flo
     """The frame in which both eyes are shut furthest, and the share of the opening that is left there."""
     left = np.zeros(len(animation.vertices))
     for one in edges:
-        moved = one.displacements(animation.vertices, animation.template)
+        moved = measured(animation.vertices, partial(one.displacements, rest=animation.template))
         gap = (one.gaps[:, 1] + moved[:, 0, :, 1] - moved[:, 1, :, 1]).mean(axis=1) / one.height
         left = np.maximum(left, gap)
     frame = int(left.argmin())
@@ -167,7 +169,8 @@ def raised_brows(animation: Animation, source: Features) -> int | None:
     above &= source.skin
     if not above.any():
         return None
-    return int((animation.vertices[:, above, 1] - animation.template[above, 1]).mean(axis=1).argmax())
+    heights = measured(animation.vertices, lambda vertices: vertices[:, above, 1])
+    return int((heights - animation.template[above, 1]).mean(axis=1).argmax())
 
 
 def _laid(correspondence: Correspondence, vertices: npt.NDArray[np.floating]) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.animation.animation import measured
 from facediff.editing.correspondence import Correspondence
 from facediff.editing.eye_fit import EyeFigures, check_eyes, fullest_blink, raised_brows
 from facediff.editing.lid_transfer import lid_edges
@@ -100,7 +101,9 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
     source, target = correspondence.features
     if source is not None:
         pairs = source.lips(correspondence.source_vertices, LIPS)
-        source_gaps = _gaps(np.stack([animation.template, *animation.vertices]), pairs)
+        rest = _gaps(animation.template[None], pairs)
+        moving = measured(animation.vertices, lambda vertices: _gaps(vertices, pairs))
+        source_gaps = np.concatenate([rest, moving])
         mean = source_gaps.mean(axis=1)
         widest = int(mean[1:].argmax())
         # Lips that are glued or torn show most where the mouth is widest.
@@ -157,7 +160,8 @@ def telling_frames(animation: Animation, correspondence: Correspondence) -> dict
     source = correspondence.features[0]
     if source is None:
         return {}
-    gaps = _gaps(animation.vertices, source.lips(correspondence.source_vertices, LIPS)).mean(axis=1)
+    lips = source.lips(correspondence.source_vertices, LIPS)
+    gaps = measured(animation.vertices, lambda vertices: _gaps(vertices, lips).mean(axis=1))
     frames = {"widest mouth": int(gaps.argmax())}
     edges = [lid_edges(correspondence.source_vertices, source, eye) for eye in (0, 1)]
     lids = [one for one in edges if one is not None]

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import secrets
-import tempfile
-from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.animation import allocate_like
 from facediff.editing.eyelids import Array, Eyes
 from facediff.mesh.flame import rotations
 from facediff.utils import ranges
-from facediff.utils.files import reserve_room
 from facediff.utils.numerics import smooth_step
 
 PROCEDURAL = "procedural"  # Metadata key: motion added by rules
@@ -365,38 +361,6 @@ def in_words(amount: Amount) -> str:
     """
     low, high = np.min(amount), np.max(amount)
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-
-def allocate_like(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """An array of the same shape to write to: in memory, or on disk where the vertices are a memory map themselves.
-
-    A file on disk lies next to the map's, or where temporary files go if that folder cannot be written, and vanishes
-    with the array.
-    """
-    if not isinstance(vertices, np.memmap):
-        return np.empty(vertices.shape, np.float32)
-    temporary = Path(tempfile.gettempdir())
-    folder = temporary if vertices.filename is None else Path(vertices.filename).parent
-    name = f".facediff-{secrets.token_hex(8)}.partial"
-    try:
-        path = folder / name
-        room = _mapped(path, vertices.shape)
-    except OSError:
-        path = temporary / name
-        room = _mapped(path, vertices.shape)
-    with suppress(OSError):  # Windows keeps a file that is in use
-        path.unlink()
-    return room
-
-
-def _mapped(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
-    array = np.memmap(path, np.float32, "w+", shape=shape)
-    try:
-        reserve_room(path)
-    except OSError:
-        path.unlink()
-        raise
-    return array
 
 
 def copied(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.animation.animation import allocate_like, stretches_of
 from facediff.editing.correspondence import (
     LIDS_AS_ALL,
     LIDS_AT_REST,
@@ -146,9 +147,12 @@ def to_y_up(carried: Animation, correspondence: Correspondence) -> Animation:
 def turned(animation: Animation, rotation: Array) -> Animation:
     """An animation in other axes: all points rotated (3, 3) about the origin, and the head's motion with them."""
     by, head = rotation.T.astype(np.float32), animation.head
+    vertices = allocate_like(animation.vertices)
+    for frames, some in stretches_of(animation.vertices):
+        vertices[frames] = some @ by
     return replace(
         animation,
-        vertices=animation.vertices @ by,
+        vertices=vertices,
         template=animation.template @ by,
         head=None if head is None else np.concatenate([head[:, :3] @ rotation.T, head[:, 3:] @ rotation.T], axis=1),
     )
@@ -227,7 +231,7 @@ def transfer(animation: Animation, correspondence: Correspondence, target: Mesh,
     head, animation = animation.head, animation.still()
     rest = np.asarray(target.vertices, np.float64)
     neutral = np.asarray(animation.template, np.float64)
-    vertices = np.empty((len(animation.vertices), len(rest), 3), np.float32)
+    vertices = allocate_like(animation.vertices, (len(animation.vertices), len(rest), 3))
     step = max(1, CHUNK_BYTES // (24 * max(len(rest), len(neutral))))
     for first in range(0, len(vertices), step):
         some = slice(first, first + step)
@@ -276,10 +280,11 @@ def _carried_head(
     share = np.clip(1.0 + (height - low) / (NECK * (high - low)), 0.0, 1.0)
     # Carried back, the lowest vertex may lie a rounding below its own height.
     whole_head = whole_head or bool((share > 0.999).all())
-    for frame, matrix, shift, motion in zip(vertices, matrices, shifts, head, strict=True):
+    for index, (matrix, shift, motion) in enumerate(zip(matrices, shifts, head, strict=True)):
         if motion.any():
+            frame = vertices[index]
             moved = frame @ matrix.T + shift
-            frame[:] = moved if whole_head else frame + share[:, None] * (moved - frame)
+            vertices[index] = moved if whole_head else frame + share[:, None] * (moved - frame)
     shifts[~head.any(axis=1)] = 0.0
     return np.concatenate([turns, shifts], axis=1) if whole_head else None
 

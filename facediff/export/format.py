@@ -8,6 +8,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -22,6 +23,9 @@ from facediff.render.meshes import face_outward, vertex_normals
 from facediff.utils.colours import to_linear
 
 MARK = b"facediff"  # Stands near the start of every file that is written without having been named by the user
+
+SOUND_PIECE = 1 << 20
+"""Samples of the speech that are converted at a time."""
 
 
 class Format(ABC):
@@ -195,20 +199,21 @@ def folder_of(path: Path) -> Path:
     return path.with_name(f"{path.stem}_{path.suffix[1:]}")
 
 
-def speech_wav(animation: Animation) -> bytes | None:
-    """The speech as a .wav file of 16 bits, exactly as long as the motion; None for a silent animation."""
+def speech_wav(animation: Animation) -> Iterator[bytes] | None:
+    """The speech as a .wav file of 16 bits in pieces, exactly as long as the motion; None for a silent animation."""
     sound = animation.sound()
     if sound is None:
         return None
     # Readers divide by 32768, so that a 16-bit recording comes back bit by bit.
-    data = np.clip(np.rint(sound * 32768), -32768, 32767).astype("<i2").tobytes()
-    rate = animation.sample_rate
+    pieces = (sound[first : first + SOUND_PIECE] for first in range(0, len(sound), SOUND_PIECE))
+    data = (np.clip(np.rint(piece * 32768), -32768, 32767).astype("<i2").tobytes() for piece in pieces)
+    rate, size = animation.sample_rate, 2 * len(sound)
     # The standard library's module wave cannot write the entry ISFT (software). It comes before the samples, where it
     # is looked for before a file is replaced: an export replaces its own .wav but never a recording of the user's.
     chunks = [
         (b"fmt ", struct.pack("<HHIIHH", 1, 1, rate, 2 * rate, 2, 16)),
         (b"LIST", b"INFOISFT" + struct.pack("<I", 10) + MARK + b"\0\0"),
-        (b"data", data),
     ]
-    body = b"WAVE" + b"".join(name + struct.pack("<I", len(content)) + content for name, content in chunks)
-    return b"RIFF" + struct.pack("<I", len(body)) + body
+    head = b"WAVE" + b"".join(name + struct.pack("<I", len(content)) + content for name, content in chunks)
+    head += b"data" + struct.pack("<I", size)
+    return chain([b"RIFF" + struct.pack("<I", len(head) + size) + head], data)

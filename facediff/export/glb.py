@@ -5,7 +5,7 @@ Source: Khronos Group, glTF 2.0 Specification. Metres, y up, the face looks alon
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -15,20 +15,20 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.animation.animation import stretches_of
 from facediff.animation.options import ExportOptions
 from facediff.editing.eyelids import puppet_eyes
 from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
 from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
+from facediff.export.motion_shapes import BLOCK, Array, Morphs, compress, compress_long
 from facediff.mesh.textures import Textures
 from facediff.registry import export_format
 from facediff.spaces.rotations import convert
 from facediff.utils.colours import to_linear
 
-Array = npt.NDArray[np.float32]
-
-BLOCK = 3000  # Coordinates that are processed together; bounds the memory for residuals
 ROUNDING = 1e-5  # Share of a face's size that single precision loses over several steps
 LINEAR = "LINEAR"  # Interpolation between keys
+LONG_BYTES = 1 << 27  # Motion that is larger is never in memory as a whole
 
 
 @export_format.register("glb")
@@ -55,25 +55,13 @@ class GlbFormat(Format):
             rest, morphs = weighted
             extras["tolerance_mm"] = options.tolerance
         else:
-            offsets = np.stack([frame - rest for frame in space.frames(animation)])
-            morphs = compress(offsets, options.tolerance / 1000)
+            morphs = shapes_of_motion(animation, space, rest, options.tolerance / 1000)
             extras["tolerance_mm"] = 0.0 if morphs.components is None else options.tolerance
         if options.speech_file is not None:
             extras["speech"] = options.speech_file
         document = make_document(animation, space, rest, morphs, extras, surface_of(animation, options))
         add_nodes(document, animation.frame_rate, moving_nodes(animation, space, head))
         document.write(path)
-
-
-@dataclass(frozen=True)
-class Morphs:
-    """A motion as shapes and their weights: frame t is ``rest + Σ weights[t, m] · shapes[m]``."""
-
-    shapes: Array  # (M, V, 3) offsets from the rest face
-    weights: Array  # (K, M) at the keys; from 0 to 1, but for a motion's own
-    components: int | None  # number of principal components that were kept; None where there is a shape for every frame
-    names: tuple[str, ...] = ()  # M names; numbers if there are none
-    keys: npt.NDArray[np.int64] | None = None  # (K,) frames that have a key; all T if None
 
 
 def named_shapes(
@@ -125,77 +113,25 @@ def weighted_shapes(animation: Animation, space: FileSpace, tolerance: float) ->
     return rest, Morphs(shapes, weights, None, names)
 
 
-def compress(offsets: Array, tolerance: float) -> Morphs:
-    """Find as few shapes as keep every vertex of every frame within a distance of the original.
-
-    The shapes are principal components of the offsets, which are not centred, so that the rest face has only weights of
-    0. If they are no fewer than the frames, every frame becomes a shape, which is exact.
+def shapes_of_motion(animation: Animation, space: FileSpace, rest: Array, tolerance: float) -> Morphs:
+    """As few shapes as keep every vertex of every frame within a distance of the original, see :func:`compress`.
 
     Args:
-        offsets: (T, V, 3) from the rest face.
-        tolerance: largest distance of a vertex, in the unit of the offsets.
+        animation: with a head that does not move.
+        space: of the file.
+        rest: (V, 3) the face at rest in it.
+        tolerance: largest distance of a vertex, in the unit of the file.
     """
-    frames, vertices, _ = offsets.shape
-    flat = offsets.reshape(frames, -1)
-    scores, axes = principal_components(flat)
-    halves = (scores > 0).any(0).astype(int) + (scores < 0).any(0)
-    # The error shrinks with the number of components, so that bisection finds the smallest number that is enough: low
-    # is not enough, high is (once there is a best). It is measured on the numbers that are written, in float32.
-    low, high, best = 0, int((halves.cumsum() < frames).sum()) + 1, None
-    while high - low > 1:
-        middle = (low + high) // 2
-        candidate = split_signs(scores[:, :middle], axes[:middle])
-        if largest_error(flat, *candidate) <= tolerance:
-            high, best = middle, candidate
-        else:
-            low = middle
-    if best is None and not flat.any():
-        best = split_signs(scores[:, :0], axes[:0])
-    if best is None:
-        return Morphs(offsets, np.eye(frames, dtype=np.float32), None)
-    return Morphs(best[1].reshape(-1, vertices, 3), best[0], high)
+    if len(animation.vertices) * rest.nbytes > LONG_BYTES:
 
+        def parts() -> Iterator[Array]:
+            for _, vertices in stretches_of(animation.vertices):
+                yield (space.place(vertices) - rest).reshape(len(vertices), -1)
 
-def principal_components(flat: Array) -> tuple[Array, Array]:
-    """Scores (T, K) and axes (K, 3V), the strongest first; their product is ``flat`` (T, 3V)."""
-    # The eigenvectors of the T × T products between frames give the same scores as a singular value decomposition, and
-    # are far cheaper, since there are fewer frames than coordinates. Squaring loses components weaker than about 1e-7
-    # of the strongest; the bisection in compress notices if one of them would have been needed.
-    gram = np.zeros((len(flat), len(flat)))
-    for block in _blocks(flat):
-        gram += block @ block.T
-    values, vectors = np.linalg.eigh(gram)
-    order = np.argsort(values)[::-1]
-    order = order[values[order] > max(values.max(), 0) * 1e-14]
-    scores = vectors[:, order]
-    axes = np.concatenate([scores.T @ block for block in _blocks(flat)], axis=1)
-    return scores.astype(np.float32), axes.astype(np.float32)
-
-
-def split_signs(scores: Array, axes: Array) -> tuple[Array, Array]:
-    """Weights (T, M) from 0 to 1 and shapes (M, 3V): the positive and the negative half of every component."""
-    # Programs that clamp weights (Blender clamps shape keys to 0 … 1) would break the signed weights of principal
-    # components. Between two frames the sum of both halves is as linear as the component, so that nothing is lost.
-    weights, shapes = [], []
-    for score, axis in zip(scores.T, axes, strict=True):
-        for sign in (1, -1):
-            half = np.maximum(sign * score, 0)
-            peak = half.max(initial=0)
-            if peak > 0:
-                weights.append(half / peak)
-                shapes.append(sign * peak * axis)
-    if not weights:  # a face that never moves still needs something to animate
-        return np.zeros((len(scores), 1), np.float32), np.zeros((1, axes.shape[1]), np.float32)
-    return np.stack(weights, 1), np.stack(shapes)
-
-
-def largest_error(flat: Array, weights: Array, shapes: Array) -> float:
-    """Largest distance of a vertex between ``flat`` (T, 3V) and the motion of weights and shapes."""
-    worst = 0.0
-    for start in range(0, flat.shape[1], BLOCK):
-        left = flat[:, start : start + BLOCK] - weights @ shapes[:, start : start + BLOCK]
-        worst = max(worst, float(np.square(left).reshape(len(flat), -1, 3).sum(-1).max()))
-    return float(np.sqrt(worst))
+        if (found := compress_long(parts, tolerance)) is not None:
+            weights, shapes, components = found
+            return Morphs(shapes.reshape(-1, *rest.shape), weights, components)
+    return compress(np.stack([frame - rest for frame in space.frames(animation)]), tolerance)
 
 
 def normal_shapes(weights: Array, rest: Array, normals: Iterable[Array]) -> Array:
@@ -209,18 +145,29 @@ def normal_shapes(weights: Array, rest: Array, normals: Iterable[Array]) -> Arra
         rest: (V, 3) normals of the rest face.
         normals: the normals (V, 3) of every frame.
     """
-    inverse = np.linalg.pinv(weights.astype(np.float64), rcond=1e-2).astype(np.float32)
-    offsets = np.zeros((len(inverse), *rest.shape), np.float32)
+    inverse = pseudo_inverse(weights)
+    offsets = np.zeros((weights.shape[1], *rest.shape), np.float32)
     turned, step = iter(normals), 16
     for start in range(0, len(weights), step):
         batch = np.stack([normal - rest for normal in islice(turned, step)])
-        offsets += np.tensordot(inverse[:, start : start + step], batch, axes=1)
+        offsets += np.tensordot(inverse(slice(start, start + step)), batch, axes=1)
     return offsets
 
 
-def _blocks(flat: Array) -> Iterator[npt.NDArray[np.float64]]:
-    for start in range(0, flat.shape[1], BLOCK):
-        yield flat[:, start : start + BLOCK].astype(np.float64)
+def pseudo_inverse(weights: Array) -> Callable[[slice], Array]:
+    """Columns (M, n) of the pseudo-inverse of weights (T, M) for some of the frames, without weak directions."""
+    if weights.nbytes <= LONG_BYTES // 16:
+        inverse = np.linalg.pinv(weights.astype(np.float64), rcond=1e-2).astype(np.float32)
+        return lambda frames: inverse[:, frames]
+    # (WᵀW)⁻¹Wᵀ, whose singular values are the roots of WᵀW's: a few columns at a time take no memory.
+    gram = np.zeros((weights.shape[1], weights.shape[1]))
+    for first in range(0, len(weights), BLOCK):
+        some = weights[first : first + BLOCK].astype(np.float64)
+        gram += some.T @ some
+    squares, vectors = np.linalg.eigh(gram)
+    strong = squares > 1e-4 * squares.max()
+    left = (vectors[:, strong] / squares[strong]) @ vectors[:, strong].T
+    return lambda frames: (left @ weights[frames].T).astype(np.float32)
 
 
 def make_document(

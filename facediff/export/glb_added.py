@@ -13,8 +13,9 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.retargeting import Z_UP, turned
 from facediff.errors import FaceDiffError, damaged
-from facediff.export.glb import Morphs, compress, normal_shapes
+from facediff.export.glb import normal_shapes
 from facediff.export.glb_writer import ARRAY_BUFFER, GlbWriter
+from facediff.export.motion_shapes import Morphs, compress
 from facediff.mesh.glb import Glb, attributes, open_glb
 from facediff.mesh.glb_scene import Placed, placed_parts
 

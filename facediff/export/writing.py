@@ -110,7 +110,8 @@ def write_animations(
 
                     add_to_glb(staged, into, group[0], options.tolerance)
                 if speech_file is not None and (wav := speech_wav(group[0])) is not None:
-                    ((folder_of(staged) if form.is_folder else hidden) / speech_file).write_bytes(wav)
+                    with ((folder_of(staged) if form.is_folder else hidden) / speech_file).open("wb") as stream:
+                        stream.writelines(wav)
         except FaceDiffError as error:
             # The format's writer names the hidden folder, which the user has never seen.
             raise FaceDiffError(str(error).replace(str(hidden), str(path.parent))) from error

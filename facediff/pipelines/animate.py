@@ -256,9 +256,9 @@ class AnimationPipeline(ABC):
                 self.corpus,
             )
 
-    def cost(self, speech: Array, output: Path, size: int) -> tuple[float, float]:
-        """Roughly the seconds on two processor cores, and the bytes, that :meth:`write` takes for some speech (S,)."""
-        duration = self.options.samples * len(speech) / SAMPLE_RATE
+    def cost(self, seconds_of_speech: float, output: Path, size: int) -> tuple[float, float]:
+        """Roughly the seconds on two processor cores, and the bytes, that :meth:`write` takes for some speech."""
+        duration = self.options.samples * seconds_of_speech
         frames = duration * self.frame_rate
         seconds = self.step_seconds * duration
         if output.suffix == ".mp4":

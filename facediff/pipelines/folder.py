@@ -325,7 +325,7 @@ def run_folder(
             for task in tasks:
                 if task.source not in states and (state := _state_after_stop(task)):
                     states[task.source] = state
-            _print_states(speeches, states)
+            _print_states(tasks, states)
     return int(any(state == "failed" for state, _ in states.values()))
 
 
@@ -355,8 +355,8 @@ def _state_after_stop(task: FileTask) -> tuple[str, str] | None:
     return None
 
 
-def _print_states(speeches: Sequence[Path], states: dict[Path, tuple[str, str]]) -> None:
-    rows = [(speech.name, *states.get(speech, ("left", ""))) for speech in speeches]
+def _print_states(tasks: Sequence[FileTask], states: dict[Path, tuple[str, str]]) -> None:
+    rows = [(task.source.name, *states.get(task.source, ("left", ""))) for task in tasks]
     table = rows if len(rows) <= TABLE else [row for row in rows if row[1] == "failed"]
     if table:
         print_table([], table, left=3)

@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.animation.animation import stretches_of
+from facediff.animation.animation import MotionMap, stretches_of
 from facediff.animation.files import MotionWriter
 from facediff.speech.audio import resampler
 from facediff.utils import SAMPLE_RATE
@@ -107,7 +107,7 @@ class Spool:
         if self._writer is None or self._file is None:
             return self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts)
         self._writer.close()
-        array = open_array(self._file)
+        array = open_array(self._file).view(MotionMap)
         with suppress(OSError):  # Windows keeps a file that is in use
             self._file.unlink()
         return array
@@ -163,10 +163,8 @@ class Sample:
         self.stretches, self._animation = None, animation
 
     def _cut(self, animation: Animation) -> Iterator[Stretch]:
-        for frames, vertices in animation.stretches():
-            part = replace(animation.part(frames), vertices=np.asarray(vertices))
-            if animation.values is not None:
-                part = part.made_of(animation.space, animation.values[frames], animation.deltas)
+        for frames, _ in stretches_of(animation.vertices):
+            part = animation.part(frames)
             turns = None if self._turns is None else self._turns[frames]
             yield Stretch(frames.start, part.vertices, turns=turns, animation=part)
 

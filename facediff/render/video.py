@@ -91,7 +91,7 @@ def write_video(
             f'video file "{target}" must end in {" or ".join(CONTAINERS)}: other containers are not written.'
         )
     rate = Fraction(frame_rate).limit_denominator(1001)
-    sound = None if audio is None else np.clip(np.asarray(audio, np.float32), -1, 1)
+    sound = None if audio is None else np.asarray(audio, np.float32)
     with atomic(target) as partial:
         return _encode(partial, frames, rate, sound, sample_rate or 0, codecs)
 
@@ -194,7 +194,7 @@ class _Encoder:
             chunk = self.sound[self.encoded_samples : self.encoded_samples + CHUNK]
             if self.encoded_samples + len(chunk) > until:
                 break
-            frame = av.AudioFrame.from_ndarray(chunk[None].copy(), format="fltp", layout="mono")
+            frame = av.AudioFrame.from_ndarray(np.clip(chunk[None], -1, 1), format="fltp", layout="mono")
             frame.sample_rate, frame.pts = self.hertz, self.encoded_samples
             frame.time_base = Fraction(1, self.hertz)
             self.encoded_samples += len(chunk)

@@ -302,6 +302,11 @@ class SpeechRecording:
     sound: npt.NDArray[np.float32]
     rate: int
 
+    @property
+    def seconds(self) -> float:
+        """Duration of the speech."""
+        return len(self.speech) / SAMPLE_RATE
+
     @classmethod
     def of(cls, samples: npt.NDArray[np.floating], rate: float, name: str, source: str) -> SpeechRecording:
         """Of samples (S,), full scale 1, at any rate; ``source`` is what errors call them."""

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation, metres_per_unit, read_animation, read_archive, write_archive
+from facediff.animation.animation import MotionMap, allocate_like, stretches_of
 from facediff.animation.files import AnimationFacts
 from facediff.errors import FaceDiffError
+from facediff.utils.arrays import open_array
 
 
 @pytest.fixture
@@ -140,3 +142,20 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert float(done.stdout) < 200
+
+
+def test_motion_in_a_file_is_read_and_written_as_an_array(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facediff.animation.animation.MAPPED_BYTES", 1000)
+    motion = np.random.default_rng(0).random((90, 7, 3)).astype(np.float32)
+    np.save(tmp_path / "motion.npy", motion)
+    mapped = open_array(tmp_path / "motion.npy").view(MotionMap)
+    parts = [vertices for _, vertices in stretches_of(mapped)]
+    assert [len(part) for part in parts] == [32, 32, 26]
+    assert not isinstance(parts[0], np.memmap)
+    np.testing.assert_array_equal(np.concatenate(parts), motion)
+    np.testing.assert_array_equal(mapped[[3, 80]], motion[[3, 80]])
+    np.testing.assert_array_equal([*mapped], motion)
+    room = allocate_like(mapped)
+    for index, frame in enumerate(motion):
+        room[index] = 2 * frame
+    np.testing.assert_array_equal(room, 2 * motion)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from facediff.animation import Animation
 from facediff.export import ExportOptions, write_animations
 from facediff.export.format import normals_of, outward
-from facediff.export.glb import compress
+from facediff.export.motion_shapes import compress
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb
 from facediff.utils.colours import to_linear, to_srgb

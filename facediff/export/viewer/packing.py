@@ -5,35 +5,71 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
+import weakref
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from tempfile import TemporaryFile
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
+from facediff.animation.animation import measured
 from facediff.errors import OptionError
 
 STEP = 0.05
 """Quantisation of positions in mm. Rounding moves a coordinate by at most half of it, a vertex by √3 / 2 of it."""
 CHUNK_FRAMES = 32  # Frames that are unpacked together; a jump in time costs one such chunk
+PIECE = 1 << 20  # Bytes of a blob that are read at a time
 LARGEST_STEP = np.iinfo(np.int16).max
 
 
 class Blobs:
-    """The binary parts of a page; equal parts are kept once."""
+    """The binary parts of a page, deflated (zlib's format) and in base64; equal parts are kept once.
+
+    They lie in a temporary file, since those of a long motion are too large for memory.
+
+    Attributes:
+        size: bytes of all texts.
+    """
 
     def __init__(self) -> None:
-        self.texts: list[str] = []  # the parts, deflated (zlib's format) and in base64
+        self._file = TemporaryFile()  # noqa: SIM115 - as long as this object
+        weakref.finalize(self, self._file.close)
+        self._sizes: list[int] = []
         self._numbers: dict[bytes, int] = {}
+        self.size = 0
 
     def add(self, data: bytes) -> int:
         """Keep bytes and return their number."""
-        digest = hashlib.sha256(data).digest()
-        if digest not in self._numbers:
-            self._numbers[digest] = len(self.texts)
-            self.texts.append(base64.b64encode(zlib.compress(data, 6)).decode("ascii"))
-        return self._numbers[digest]
+        return self.add_pieces([data])
+
+    def add_pieces(self, pieces: Iterable[bytes]) -> int:
+        """Keep bytes that come piece by piece."""
+        digest, deflate = hashlib.sha256(), zlib.compressobj(6)
+        size, waiting = 0, b""
+        for piece in pieces:
+            digest.update(piece)
+            waiting += deflate.compress(piece)
+            whole = len(waiting) // 3 * 3  # bytes of four letters each
+            size += self._file.write(base64.b64encode(waiting[:whole]))
+            waiting = waiting[whole:]
+        size += self._file.write(base64.b64encode(waiting + deflate.flush()))
+        number = self._numbers.setdefault(digest.digest(), len(self._sizes))
+        if number == len(self._sizes):
+            self._sizes.append(size)
+            self.size += size
+        self._file.seek(self.size)
+        return number
+
+    def elements(self) -> Iterator[str]:
+        """The elements of a page that hold them, in pieces and in the order of their numbers."""
+        self._file.seek(0)
+        for number, size in enumerate(self._sizes):
+            yield f'<script type="text/plain" id="blob-{number}">'
+            for start in range(0, size, PIECE):
+                yield self._file.read(min(PIECE, size - start)).decode("ascii")
+            yield "</script>\n"
 
 
 def millimetres(animation: Animation) -> float:
@@ -74,9 +110,12 @@ def mouth_opening(animation: Animation) -> npt.NDArray[np.float32] | None:
     pairs = animation.inner_lip_pairs
     if pairs is None or not len(pairs):
         return None
-    lips = np.asarray(animation.vertices[:, pairs], np.float64)
-    distances = np.linalg.norm(lips[:, :, 0] - lips[:, :, 1], axis=2)
-    return np.asarray(distances.mean(axis=1) * millimetres(animation), np.float32)
+
+    def opening(vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+        lips = np.asarray(vertices[:, pairs], np.float64)
+        return np.asarray(np.linalg.norm(lips[:, :, 0] - lips[:, :, 1], axis=2).mean(axis=1))
+
+    return np.asarray(measured(animation.vertices, opening) * millimetres(animation), np.float32)
 
 
 def bounds(animation: Animation) -> tuple[list[float], list[float]]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import html
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -71,9 +72,8 @@ class PageFormat(Format):
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write a page that shows all animations next to each other."""
-        write_page(
-            path, [animation if not options.no_speech else replace(animation, speech=None) for animation in animations]
-        )
+        shown = [animation if not options.no_speech else replace(animation, speech=None) for animation in animations]
+        write_page(path, shown, max_mb=math.inf)
 
 
 def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 30.0, truth: int | None = None) -> None:
@@ -92,18 +92,18 @@ def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 3
             distance of each vertex from it.
     """
     check_writable(path)
-    parts = page_parts(animations, truth=truth)
-    size = sum(len(part.encode()) for part in parts) / 1_000_000
-    if size > max_mb:
-        raise FaceDiffError(
-            f"{path}: would have {size:.1f} MB, more than the limit of {max_mb:g} MB; show fewer or shorter "
-            f"animations, or raise the limit (`facediff view --max-mb`)"
-        )
-    with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
-        stream.writelines(parts)
+    with atomic(path) as temporary:
+        with temporary.open("w", encoding="utf-8", newline="\n") as stream:
+            stream.writelines(page_parts(animations, truth=truth))
+        size = temporary.stat().st_size / 1_000_000
+        if size > max_mb:
+            raise FaceDiffError(
+                f"{path}: would have {size:.1f} MB, more than the limit of {max_mb:g} MB; show fewer or shorter "
+                f"animations, or raise the limit (`facediff view --max-mb`)"
+            )
 
 
-def page_parts(animations: Sequence[Animation], *, truth: int | None = None) -> list[str]:
+def page_parts(animations: Sequence[Animation], *, truth: int | None = None) -> Iterator[str]:
     """The text of the page in pieces, in order, as :func:`write_page` writes it.
 
     Args:
@@ -158,7 +158,7 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
         "frames": len(animations[0].vertices),
         "step": STEP,
         "chunkFrames": CHUNK_FRAMES,
-        "sound": None if sound is None else blobs.add(sound),
+        "sound": None if sound is None else blobs.add_pieces(sound),
         "sounds": sounds(animations),
         "truth": truth,
         "heat": heat,
@@ -245,7 +245,7 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
     }
 
 
-def _page_parts(facts: dict[str, Any], blobs: Blobs) -> list[str]:
+def _page_parts(facts: dict[str, Any], blobs: Blobs) -> Iterator[str]:
     """The text of the page in pieces, in order."""
     title = html.escape(" · ".join(animation["name"] for animation in facts["animations"]))
     return assemble(
@@ -263,7 +263,7 @@ def assemble(
     *,
     loads: str,
     own_scripts: bool = False,
-) -> list[str]:
+) -> Iterator[str]:
     """A page of this package's assets in pieces, in order.
 
     Args:
@@ -291,8 +291,9 @@ def assemble(
     }
     template = _asset("head.html") + _asset(page)
     before, after = (fill(part, filled) for part in template.split("{{blobs}}"))
-    texts = enumerate(blobs.texts)
-    return [before, *(f'<script type="text/plain" id="blob-{n}">{text}</script>\n' for n, text in texts), after]
+    yield before
+    yield from blobs.elements()
+    yield after
 
 
 def script_of(parts: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ are seen from the front. It sends the places as triangles and weights of the mes
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -96,7 +96,7 @@ class Picking:
         return len(landmarks)
 
 
-def picking_page(picking: Picking) -> list[str]:
+def picking_page(picking: Picking) -> Iterator[str]:
     """The text of the page in pieces, in order. It loads nothing, and talks to its own server only."""
     source, target = picking.source, picking.target
     rest: Array = np.asarray(source.template, np.float64)

@@ -33,6 +33,7 @@ import sys
 import threading
 import webbrowser
 import zlib
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -334,7 +335,7 @@ def _mesh(performance: Performance, scale: float) -> bytes:
     return head + (neutral.astype(np.float64) * scale).astype("<f4").tobytes() + triangles.tobytes() + colours
 
 
-def page(subject: str) -> list[str]:
+def page(subject: str) -> Iterator[str]:
     """The text of the page in pieces, in order."""
     from facediff.export.viewer.packing import Blobs
     from facediff.export.viewer.page import assemble

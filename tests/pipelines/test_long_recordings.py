@@ -1,0 +1,45 @@
+"""Memory of a whole run does not grow with the motion, which is twenty times as large as its speech."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facediff.speech.audio import read_speech, write_wav
+
+SPEECH = Path(__file__).parents[2] / "docs" / "examples" / "speech.wav"
+PEAK = """
+import resource, sys
+from facediff.cli.app import main
+status = main(sys.argv[1:])
+print("PEAK", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+sys.exit(status)
+"""
+
+
+def peak_of(seconds: int, output: Path, *options: str) -> float:
+    """Megabytes of a process that animates speech of a length with the model that comes with facediff."""
+    recording = output.with_name(f"{seconds}s.wav")
+    write_wav(recording, np.resize(read_speech(SPEECH), seconds * 16_000), 16_000)
+    arguments = ["animate", str(recording), "-o", str(output), "--seed", "1", "--quiet", "--yes", *options]
+    run = subprocess.run([sys.executable, "-c", PEAK, *arguments], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    return int(run.stdout.rpartition("PEAK ")[2]) / 1024
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="pages of files are given back on Linux")
+def test_memory_grows_by_the_speech_alone(tmp_path: Path) -> None:
+    short, long = (peak_of(seconds, tmp_path / "x.npz", "--blinks") for seconds in (30, 120))
+    assert (tmp_path / "x.npz").stat().st_size > 200e6
+    assert long - short < 40
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="pages of files are given back on Linux")
+@pytest.mark.parametrize(("suffix", "options"), [(".npz", ()), (".glb", ()), (".html", ()), (".mp4", ("--size", "64"))])
+def test_an_hour_takes_less_than_600_mb(tmp_path: Path, suffix: str, options: tuple[str, ...]) -> None:
+    assert peak_of(3600, tmp_path / f"x{suffix}", *options) < 600
