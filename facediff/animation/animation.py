@@ -350,13 +350,14 @@ class Animation:
         return f'Animation("{self.name}": {", ".join(facts)})'
 
 
-class MotionMap(np.memmap):  # type: ignore[type-arg]
+class MotionMap(np.memmap):
     """Motion in a file that takes little memory, however long it is: pages that were read or written are given back.
 
     Its items are plain views of the file.
     """
 
     _touched = 0
+    _mmap: mmap.mmap | None  # NumPy's; the only way to give pages back
 
     def __getitem__(self, index: Any) -> Any:  # noqa: ANN401 - as of an array
         item = super().__getitem__(index)
@@ -371,7 +372,7 @@ class MotionMap(np.memmap):  # type: ignore[type-arg]
         self._touched += count
         if self._touched > MAPPED_BYTES and self._mmap is not None and hasattr(mmap, "MADV_DONTNEED"):
             self._touched = 0
-            self._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+            self._mmap.madvise(mmap.MADV_DONTNEED)
 
 
 def stretches_of(motion: npt.NDArray[np.float32]) -> Iterator[tuple[slice, npt.NDArray[np.float32]]]:

@@ -177,8 +177,8 @@ def animate_recording(
         from facediff.export.glb_own_shapes import own_shapes, unused_shapes
 
         mesh = Path(options.target_mesh)
-        notes = [] if pipeline.retarget is None else pipeline.retarget.notes
-        tell(*notes, *surface_notes(mesh, output, animation))
+        fit_notes = [] if pipeline.retarget is None else pipeline.retarget.notes
+        tell(*fit_notes, *surface_notes(mesh, output, animation))
         if options.own_shapes:
             avatar = own_shapes(mesh)
             tell(avatar.summary, *avatar.left_out(animation))

@@ -301,7 +301,7 @@ class Scorer:
         means, deviations = one_pass(
             clip.prediction,
             clip.truth,
-            errors=[metric.wanted() for metric in errors.values()],
+            errors=[metric.error_of() for metric in errors.values()],
             template=clip.template,
             uppers=[metric.indices for metric in dynamics.values()],
         )

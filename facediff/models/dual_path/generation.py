@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -132,7 +133,7 @@ class Generation(Recipe):
 
     def empty_state(self, denoiser: ConditionalDenoiser) -> Tensor:
         """A state with no values yet."""
-        rows, frames = denoiser.conditions.mask.shape
+        rows, frames = cast(Conditions, denoiser.conditions).mask.shape
         shape = (rows // len(denoiser.shares), frames, denoiser.width)
         return torch.empty(shape, device=self.device, dtype=next(self.parameters()).dtype)
 

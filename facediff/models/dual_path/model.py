@@ -166,6 +166,7 @@ class DualPathDiffusion(Generation):
     """
 
     samples: ClassVar[bool] = True
+    options: DualPathOptions
     chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options", "guidance")
 
     @takes_options(DualPathOptions)

@@ -137,7 +137,7 @@ class RecipeOptions(HidingOptions, Protocol):
     """Options of :class:`~facediff.models.dual_path.model.DualPathOptions` that are read here."""
 
     noise_scale: NoiseScale
-    timestep_sampling: str
+    timestep_sampling: Literal["uniform", "log_snr"]
     sampling_space: SamplingSpace
 
     @property
