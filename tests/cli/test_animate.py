@@ -139,7 +139,7 @@ def test_bad_options(
     for words, sentence in (
         ("--identity Zoe", '--identity: there is no "Zoe"; the checkpoint has A, B, C'),
         ("--style other.npy", "has shape (9, 31, 3); the model's faces have 24 vertices"),
-        ("--style far.npy", "so it must be another person's"),
+        ("--style far.npy", "it is not A's"),
         ("--style A_e99", "no clip of that name"),
         ("--sampler dim", 'there is no sampler "dim": did you mean "ddim"?'),
         ("-o x.gif", 'there is no format ".gif"'),

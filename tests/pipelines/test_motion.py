@@ -148,7 +148,7 @@ def test_controls_are_those_of_the_command(anim: facediff.Animation, tmp_path: P
     assert np.array_equal(anim.control(sway=False).vertices, anim.vertices)
     assert np.array_equal(anim.control(sway=True).vertices, anim.control(sway=2.0).vertices)
     assert not anim.control(expressiveness=0).vertices.std(0).any(), "0 is a number, and not nothing"
-    with pytest.raises(facediff.FaceDiffError, match="^blinks: needs"):
+    with pytest.raises(facediff.FaceDiffError, match="^blinks: lids"):
         anim.control(blinks=True)
 
 
