@@ -370,8 +370,7 @@ class MotionMap(np.memmap):
 
     def _release(self, count: int) -> None:
         self._touched += count
-        pages = getattr(self, "_mmap", None)  # of an array in memory None
-        if self._touched > MAPPED_BYTES and pages is not None and hasattr(mmap, "MADV_DONTNEED"):
+        if self._touched > MAPPED_BYTES and self._mmap is not None and hasattr(mmap, "MADV_DONTNEED"):
             self._touched = 0
             self._mmap.madvise(mmap.MADV_DONTNEED)
 
