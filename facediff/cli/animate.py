@@ -122,7 +122,7 @@ def animate(
     if isinstance(generation.style, str):
         from facediff.cli.track import with_tracked_styles
 
-        words = with_tracked_styles(generation.style, checkpoint, generation.identity)
+        words = with_tracked_styles(generation.style, checkpoint)
         generation = replace(generation, style=words)
     options = AnimationOptions.of(
         generation, windows, recording, controls, target, device, licence, checkpoint=checkpoint, quiet=quiet

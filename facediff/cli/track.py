@@ -130,7 +130,7 @@ def person(
     )
 
 
-def with_tracked_styles(style: str, checkpoint: Path | str, identity: str | None) -> str:
+def with_tracked_styles(style: str, checkpoint: Path | str) -> str:
     """The words of ``--style`` with a motion, on the model's face, in place of each video of a person."""
     from facediff.animation.style_files import split_styles
     from facediff.data.track.video import SUFFIXES
@@ -140,12 +140,12 @@ def with_tracked_styles(style: str, checkpoint: Path | str, identity: str | None
     names = []
     for part in split_styles(style):
         is_video = Path(part.name).suffix.lower() in SUFFIXES
-        name = tracked_style(Path(part.name), checkpoint, identity) if is_video else part.name
+        name = tracked_style(Path(part.name), checkpoint) if is_video else part.name
         names.append(str(name) if part.weight is None else f"{name}:{part.weight!r}")
     return ",".join(names)
 
 
-def tracked_style(video: Path, checkpoint: Path | str, identity: str | None) -> Path:
+def tracked_style(video: Path, checkpoint: Path | str) -> Path:
     """A file with the motion of a video's first clip on the face of a model; it is kept for the next time."""
     import numpy as np
 
@@ -157,8 +157,7 @@ def tracked_style(video: Path, checkpoint: Path | str, identity: str | None) -> 
     from facediff.utils.files import cache_dir, scratch_folder
 
     model = facediff.load(checkpoint)
-    who = identity or model.identities[0]
-    key = ArrayStore.key(sha256(video), model.corpus, model.n_vertices, who)
+    key = ArrayStore.key(sha256(video), model.corpus, model.n_vertices)
     target = cache_dir() / "styles" / key / f"{video.stem}.npz"
     if target.is_file():
         return target
@@ -166,7 +165,7 @@ def tracked_style(video: Path, checkpoint: Path | str, identity: str | None) -> 
         track_people({"style": [video]}, scratch / "people", TrackingOptions(face="largest"), workers=1)
         motion = first_clip(scratch / "people")
         if model.n_vertices != len(motion.template):
-            still = model.animate(np.zeros(SAMPLE_RATE, np.float32), SAMPLE_RATE, identity=who, seed=0)
+            still = model.animate(np.zeros(SAMPLE_RATE, np.float32), SAMPLE_RATE, seed=0)
             write_mesh(scratch / "face.ply", still.template, still.triangles)
             motion = motion.retarget(scratch / "face.ply")
         motion.save(target)

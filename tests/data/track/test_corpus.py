@@ -207,10 +207,10 @@ def test_a_video_gives_a_style_on_the_models_face(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
     model = SimpleNamespace(identities=["ada"], corpus="people", n_vertices=468)
     monkeypatch.setattr("facediff.load", lambda checkpoint: model)
-    words = with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt", None)
+    words = with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt")
     file, weight = words.split(",")[0].rsplit(":", 1)
     motion = facediff.read(file)
     assert (motion.vertices.shape[1:], motion.name, weight) == ((468, 3), "style_s001", "0.5")
-    assert with_tracked_styles("F1_e05", "model.ckpt", None) == "F1_e05"
+    assert with_tracked_styles("F1_e05", "model.ckpt") == "F1_e05"
     monkeypatch.setattr("facediff.data.track.corpus.track_people", None)  # the second time nothing is tracked
-    assert with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt", None) == words
+    assert with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt") == words
