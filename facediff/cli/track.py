@@ -25,6 +25,8 @@ Name = Annotated[str | None, Option(metavar="NAME")]
 CONFIG = "configs/experiment/people.yaml"
 STEPS = 400
 """Of training by ``facediff person``."""
+ONE_PERSON = ("--model.audio_encoder.frozen=false", "--data.augmentations=null", "--data.augmented_share=1.0")
+"""Settings that were measured with one person, docs/results/people.md."""
 PREVIEW_RATE, CURVES = 25, 96
 """Frames a second, and height of the curves in pixels."""
 
@@ -115,7 +117,7 @@ def person(
         if not check(root, None, progress=not quiet).sound:
             raise FaceDiffError(f"{root}: is not sound; `facediff data check {root}` says why")
         data = People(root=str(root))
-        options = ["--config", CONFIG, f"--data.root={root}", f"--trainer.max_steps={steps}"]
+        options = ["--config", CONFIG, f"--data.root={root}", f"--trainer.max_steps={steps}", *ONE_PERSON]
         options += [f"--trainer.logger.save_dir={root}", "--trainer.logger.name=.training"]
         options += [] if data.clips("val") else ["--trainer.limit_val_batches=0"]
         options += ["--ckpt_path", "last"] if any((root / ".training").glob(f"*/{LAST}")) else []
