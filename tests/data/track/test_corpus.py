@@ -214,3 +214,14 @@ def test_a_video_gives_a_style_on_the_models_face(tmp_path: Path, monkeypatch: p
     assert with_tracked_styles("F1_e05", "model.ckpt") == "F1_e05"
     monkeypatch.setattr("facediff.data.track.corpus.track_people", None)  # the second time nothing is tracked
     assert with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt") == words
+
+
+def test_an_unseen_persons_only_clip_stops_no_test(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    videos = write_people(
+        tmp_path / "videos", {"ada": [talking(2.4)] * 4, "ben": [talking(2.4)] * 2, "fay": [talking(2.4)]}
+    )
+    assert track(videos, tmp_path / "people") == 0
+    data = People(root=str(tmp_path / "people"), extra_identities=["ada"])
+    data._splits = {name: "test_b" if name[:3] in ("ben", "fay") else "train" for name in data.corpus.clips}
+    assert [clip.identity for clip in data.dataset("test_b").clips] == ["ben", "ben"]
+    assert "their speakers' only clips: fay_s001" in capsys.readouterr().out
