@@ -19,7 +19,7 @@ from facediff.utils.option import Option
 from facediff.utils.output_paths import protect, refuse_equal, refuse_overwriting
 
 
-class Parameter(Protocol):
+class PathParameter(Protocol):
     """The parts of a command's parameter that checks read (:mod:`facediff.cli.parsing` makes it)."""
 
     @property
@@ -39,7 +39,7 @@ class Parameter(Protocol):
         """Whether its values are paths, and not texts that may be one."""
 
 
-def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
+def check_paths(parameters: Sequence[PathParameter], values: Mapping[str, Any]) -> None:
     """Refuse, before any work is done, files that cannot be read or written, and outputs that are inputs.
 
     The inputs are protected from then on: no output of the command replaces one of them.
@@ -73,7 +73,7 @@ def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> N
     protect(inputs)
 
 
-def given_paths(parameter: Parameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
+def given_paths(parameter: PathParameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
     """The paths in a value; in a text, such as ``NAME=FOLDER`` or ``a.npy:0.3,b.npy:0.7``, all that may be one."""
     option = parameter.option
     if value is None or not (parameter.is_path or option.reads or option.writes):

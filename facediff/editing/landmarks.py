@@ -461,7 +461,7 @@ def parse_landmarks(
 
 
 @dataclass(frozen=True)
-class _Row:
+class _LandmarkRow:
     name: Annotated[str, Text(longest=LONGEST_NAME)]
     source: Any = None
     target: Any = None
@@ -472,7 +472,7 @@ class _File:
     """The content of a .json file of landmarks."""
 
     format: str
-    landmarks: tuple[_Row, ...]
+    landmarks: tuple[_LandmarkRow, ...]
     source_vertices: int | None = None
     target_vertices: int | None = None
 

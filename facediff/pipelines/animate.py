@@ -34,7 +34,7 @@ from facediff.pipelines.stages import (
     Generate,
     Rest,
     Retarget,
-    Sample,
+    SampleMotion,
     Stage,
     Take,
     VertexGenerator,
@@ -320,7 +320,7 @@ class AnimationPipeline(ABC):
         )
         with spool as folder:
             samples = [
-                Sample(first + i, name if count == 1 else f"{name}, sample {i + 1}", folder) for i in range(count)
+                SampleMotion(first + i, name if count == 1 else f"{name}, sample {i + 1}", folder) for i in range(count)
             ]
             take = Take(recording, recording.speech, samples)
             for stage in self.stages:
@@ -362,7 +362,7 @@ class AnimationPipeline(ABC):
             yield item
             report(count, max(count, total))
 
-    def still(self, sample: Sample | None) -> Animation:
+    def still(self, sample: SampleMotion | None) -> Animation:
         """The face at rest, one frame: of a sample, with everything that its animation says; or of a stream."""
         template = self.facts["template"]
         if sample is None:

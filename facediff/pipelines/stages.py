@@ -114,7 +114,7 @@ class Spool:
 
 
 @dataclass(eq=False)
-class Sample:
+class SampleMotion:
     """One sample of a recording: its frames, still to come in stretches, or all of them as an animation.
 
     Attributes:
@@ -182,7 +182,7 @@ class Take:
 
     recording: SpeechRecording
     speech: Array
-    samples: list[Sample]
+    samples: list[SampleMotion]
     frames: int = 0
 
 
@@ -391,7 +391,7 @@ class Decode(Stage):
         decoder: turns channels into vertices; None where the points are vertices.
     """
 
-    def __init__(self, animation: Callable[[Sample | None], Animation], decoder: ChannelDecoder | None) -> None:
+    def __init__(self, animation: Callable[[SampleMotion | None], Animation], decoder: ChannelDecoder | None) -> None:
         self.animation, self.decoder = animation, decoder
 
     def apply(self, stretch: Stretch, still: Animation) -> Stretch:
@@ -551,7 +551,7 @@ class Retarget(Stage):
         )
         return carried
 
-    def _judge(self, animation: Animation, correspondence: Correspondence, report: FitReport) -> None:
+    def _judge(self, animation: Animation, transfer: Correspondence, report: FitReport) -> None:
         from facediff.editing.fit_check import refuse_poor
 
         refuse_poor(self.mesh, report)

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from facediff.data import Batch
 from facediff.models.dual_path.conditioning import Conditions
-from facediff.models.dual_path.recipe import Recipe
+from facediff.models.dual_path.recipe import DualPathRecipe
 from facediff.models.folding import Blend, ConditionalDenoiser, unchanged
 from facediff.models.inference import ClipNoise, Progress, WindowNoise, WindowOverlap
 from facediff.models.samplers import NoiseSource
 from facediff.speech.windows import MotionWindow
 
 
-class Generation(Recipe):
+class Generation(DualPathRecipe):
     """Calls :meth:`sample` for clips, samples and windows, each with its own noise."""
 
     @abstractmethod

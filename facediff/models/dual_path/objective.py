@@ -1,7 +1,7 @@
 """The losses of a training step (eq. 15 to 19) of noisy versions of clips, and how they are noised (eq. 1).
 
-An objective knows the clean motion of a batch. The model calls it twice: :meth:`Objective.inputs` before the network,
-with unit noise, and :meth:`Objective.losses` after it, with the decoder's features F_dec.
+An objective knows the clean motion of a batch. The model calls :meth:`TrainingObjective.inputs` before the network, with
+unit noise, and :meth:`TrainingObjective.losses` after it, with the features F_dec of the decoder.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from facediff.data import Batch
 from facediff.models.dual_path.network import DualPathNetwork
-from facediff.models.dual_path.recipe import Recipe
+from facediff.models.dual_path.recipe import DualPathRecipe
 from facediff.models.losses import preconditioned_losses
 from facediff.models.losses_fused import fused_losses
 from facediff.models.motion_space import Preconditioning
@@ -25,7 +25,7 @@ from facediff.models.samplers import NoiseProcess
 
 
 @dataclass(kw_only=True)
-class Objective(ABC):
+class TrainingObjective(ABC):
     """Noise and losses of one training step.
 
     Attributes:
@@ -55,7 +55,7 @@ class Objective(ABC):
 
 
 @dataclass(kw_only=True)
-class VertexObjective(Objective):
+class VertexObjective(TrainingObjective):
     """The paper's: Huber losses of the position, velocity and acceleration of vertices, and L_face (eq. 15 to 19).
 
     Attributes:
@@ -95,7 +95,7 @@ class VertexObjective(Objective):
 
 
 @dataclass(kw_only=True)
-class ComponentObjective(Objective):
+class ComponentObjective(TrainingObjective):
     """Squared errors in a space of known variances; the network predicts the part that the noisy motion leaves open.
 
     Attributes:
@@ -120,7 +120,7 @@ class ComponentObjective(Objective):
         return preconditioned_losses(predicted, self.motion, self.mask, importance, self.weights)
 
 
-def objective_of(model: Recipe, batch: Batch, step: Int[Tensor, " draws"], draws: int) -> Objective:
+def objective_of(model: DualPathRecipe, batch: Batch, step: Int[Tensor, " draws"], draws: int) -> TrainingObjective:
     """The objective of a model's motion space.
 
     Args:

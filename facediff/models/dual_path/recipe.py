@@ -145,7 +145,7 @@ class RecipeOptions(HidingOptions, Protocol):
         """The weights of eq. 15."""
 
 
-class Recipe(ConditionedModel):
+class DualPathRecipe(ConditionedModel):
     """A dual-path model's measurements before its training, and the settings of its sampling."""
 
     low_latency_steps = LOW_LATENCY_STEPS
@@ -195,7 +195,7 @@ class Recipe(ConditionedModel):
             token.measure(torch.stack([faces[identity] for identity in self.identities if identity in faces]))
         return shapes
 
-    def scale_like(self, reference_model: Recipe, data: SpeechMotionDataModule) -> None:
+    def scale_like(self, reference_model: DualPathRecipe, data: SpeechMotionDataModule) -> None:
         """Give the largest movement the size that it has in another face's model.
 
         Unit variance of a coordinate says little: 60 weights are smaller as a whole than the coordinates of 6 000
