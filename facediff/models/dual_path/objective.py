@@ -1,7 +1,7 @@
 """The losses of a training step (eq. 15 to 19) of noisy versions of clips, and how they are noised (eq. 1).
 
-An objective knows the clean motion of a batch. The model calls :meth:`TrainingObjective.inputs` before the network, with
-unit noise, and :meth:`TrainingObjective.losses` after it, with the features F_dec of the decoder.
+An objective knows the clean motion of a batch. The model calls :meth:`TrainingObjective.inputs` before the network,
+with unit noise, and :meth:`TrainingObjective.losses` after it, with the features F_dec of the decoder.
 """
 
 from __future__ import annotations
