@@ -270,6 +270,11 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         array([[0.5]])
     """
     options = options or SolveOptions()
+    if shapes.deltas.shape[1] != len(animation.template):
+        raise FaceDiffError(
+            f"{animation.name}: has {len(animation.template)} vertices and the shapes {shapes.deltas.shape[1]}; give "
+            f"shapes of the same mesh, or carry them over with `facediff blendshapes --carry`"
+        )
     animation.refuse_not_finite()
     head, animation = animation.head, animation.still()
     moving = moving_shapes(animation, shapes, options)

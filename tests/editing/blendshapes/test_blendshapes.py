@@ -259,3 +259,12 @@ def test_a_motion_that_stands_still_has_no_share() -> None:
     assert not found.residual_share.any()
     assert found.absent[0] == "eyeBlinkLeft"
     assert found.extra == ("mine",)
+
+
+def test_shapes_of_a_larger_mesh_are_not_cut() -> None:
+    """They would fit the first vertices of another mesh, without a word."""
+    neutral = np.random.default_rng(0).normal(size=(9, 3))
+    animation = Animation("nod", neutral[None] + 0.01, neutral, frame_rate=30.0)
+    larger = ShapeSet(("jawOpen",), np.zeros((12, 3)), np.full((1, 12, 3), 0.01))
+    with pytest.raises(FaceDiffError, match="has 9 vertices and the shapes 12"):
+        solve(animation, larger)
