@@ -154,6 +154,8 @@ def tracked_style(video: Path, checkpoint: Path | str) -> Path:
     import facediff
     from facediff.data.preparation import write_mesh
     from facediff.data.track.corpus import track_people
+    from facediff.editing.fit_check import refuse_poor
+    from facediff.editing.retargeting import retarget
     from facediff.utils.arrays import ArrayStore
     from facediff.utils.checksums import sha256
     from facediff.utils.files import cache_dir, scratch_folder
@@ -168,8 +170,9 @@ def tracked_style(video: Path, checkpoint: Path | str) -> Path:
         motion = first_clip(scratch / "people")
         if model.n_vertices != len(motion.template):
             still = model.animate(np.zeros(SAMPLE_RATE, np.float32), SAMPLE_RATE, seed=0)
-            write_mesh(scratch / "face.ply", still.template, still.triangles)
-            motion = motion.retarget(scratch / "face.ply")
+            face = scratch / "face.ply"
+            write_mesh(face, still.template, still.triangles)
+            motion, _ = retarget(motion, face, check=lambda _, __, report: refuse_poor(face, report))
         motion.save(target)
     return target
 
