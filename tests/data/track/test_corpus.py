@@ -225,3 +225,16 @@ def test_an_unseen_persons_only_clip_stops_no_test(tmp_path: Path, capsys: pytes
     data._splits = {name: "test_b" if name[:3] in ("ben", "fay") else "train" for name in data.corpus.clips}
     assert [clip.identity for clip in data.dataset("test_b").clips] == ["ben", "ben"]
     assert "their speakers' only clips: fay_s001" in capsys.readouterr().out
+
+
+def test_a_corpus_keeps_its_own_frame_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_people(tmp_path / "videos", {"ada": [talking(3, seed=i) for i in range(4)]})
+    assert track(tmp_path / "videos", tmp_path / "people", "--frame-rate", "30") == 0
+    data = People(root=str(tmp_path / "people"))
+    sample = data.dataset("train", training=True)[0]
+    assert (data.frame_rate, data.assets().frame_rate) == (30.0, 30.0)
+    assert abs(len(sample.audio) - len(sample.motion) * 16_000 / 30) < 16_000 / 30
+    capsys.readouterr()
+    assert main(["data", "check", str(tmp_path / "people"), "--json"]) == 0
+    kinds = {finding["kind"] for finding in json.loads(capsys.readouterr().out)["findings"]}
+    assert kinds == {"sound_copied"}  # the sounds of these videos are alike
