@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 from facediff import registry
 from facediff.data.corpus import Clip, read_clip_table, read_manifest
-from facediff.data.datamodule import Count, SpeechMotionDataModule, person_licence
+from facediff.data.datamodule import SpeechMotionDataModule, person_licence
 from facediff.data.packed.stores import is_packed
 from facediff.errors import FaceDiffError
 from facediff.utils.licences import Licence, merged, read_licences
@@ -50,7 +50,6 @@ class People(SpeechMotionDataModule):
         root: the corpus folder.
         extra_identities: people to train on; all but the people of test B if None.
         test_people: share of the people who are test B.
-        batch_size: clips a batch; used where no frame budget is given.
         options: of every data module.
     """
 
@@ -69,14 +68,13 @@ class People(SpeechMotionDataModule):
         root: str,
         extra_identities: list[str] | None = None,
         test_people: Annotated[float, Range(0, 1)] = 0.2,
-        batch_size: Count = 8,
         **options: Any,  # noqa: ANN401
     ) -> None:
         folder = Path(root).expanduser()
         names = people_of(folder)
         unseen = unseen_people(names, test_people)
         identities = extra_identities or [name for name in names if name not in unseen]
-        super().__init__(root=root, extra_identities=identities, batch_size=batch_size, **options)
+        super().__init__(root=root, extra_identities=identities, **options)
         if folder.is_dir():
             self.frame_rate = float(read_manifest(folder).get("frame_rate") or 25)  # type: ignore[misc]
 
