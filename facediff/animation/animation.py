@@ -272,15 +272,17 @@ class Animation:
         *,
         correspondence: str | Path | None = None,
         landmarks: str | Path | None = None,
+        accept_poor: bool = False,
     ) -> Animation:
-        """The same motion on another mesh.
+        """The same motion on another mesh; a result with lips that stick or skin that tears is refused.
 
         Args:
             target_mesh: the other face at rest: .obj, .ply, .glb …
             correspondence: .npz to use if it exists, else to write for other animations.
             landmarks: .csv of pairs of vertices that are one place, or the .json of `facediff retarget --pick`.
+            accept_poor: give the result of a new correspondence as it is.
         """
-        animation: Animation = late(f"{MOTION}:retarget")(self, target_mesh, correspondence, landmarks)
+        animation: Animation = late(f"{MOTION}:retarget")(self, target_mesh, correspondence, landmarks, accept_poor)
         return animation
 
     def drive(self, avatar: str | Path, path: str | Path) -> list[Path]:

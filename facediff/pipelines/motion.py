@@ -69,16 +69,23 @@ def control(animation: Animation, controls: AnimationControls) -> Animation:
 
 
 def retarget(
-    animation: Animation, mesh: str | Path, map_file: str | Path | None, landmarks: str | Path | None
+    animation: Animation,
+    mesh: str | Path,
+    map_file: str | Path | None,
+    landmarks: str | Path | None,
+    accept_poor: bool = False,  # noqa: FBT001, FBT002 - of the method
 ) -> Animation:
     """The motion on another mesh: :meth:`Animation.retarget`."""
+    from facediff.editing.fit_check import refuse_poor
     from facediff.editing.retargeting import retarget as transfer
 
     for option, file in (("target_mesh", mesh), ("landmarks", landmarks)):
         if file is not None and not Path(file).is_file():
             raise OptionError(option, "no such file; expected a mesh or a table of its vertices", file)
     files = [None if file is None else Path(file) for file in (map_file, landmarks)]
-    return transfer(animation, Path(mesh), *files)[0]
+    if accept_poor or (files[0] is not None and files[0].exists()):  # a map that exists was accepted when it was made
+        return transfer(animation, Path(mesh), *files)[0]
+    return transfer(animation, Path(mesh), *files, check=lambda _, __, report: refuse_poor(mesh, report))[0]
 
 
 def drive(animation: Animation, avatar: str | Path, path: str | Path) -> list[Path]:

@@ -160,6 +160,10 @@ def test_other_meshes_and_weights_are_those_of_the_commands(model: facediff.Anim
     assert isinstance(made, facediff.Animation)
     assert Path("map.npz").is_file()
     np.testing.assert_array_equal(made.vertices, facediff.read("command.npz").vertices)
+    trimesh.creation.icosphere(3, radius=0.1).export("ball.ply")
+    with pytest.raises(facediff.FaceDiffError, match=r"ball\.ply: no line between its lips.*accept_poor"):
+        anim.retarget("ball.ply")
+    assert len(anim.retarget("ball.ply", accept_poor=True).template) == 642
     carried = model.animate("speech.wav", identity="F1", target_mesh="face.ply", correspondence="map.npz")
     np.testing.assert_array_equal(made.vertices, carried.vertices)
     face = trimesh.load("face.ply", process=False)
