@@ -48,14 +48,14 @@ def check_known(source: object, kind: str, names: Iterable[str], candidates: Col
     """Refuse names that are none of the candidates.
 
     Args:
-        source: file or option that has the names.
+        source: file or option that has the names; an option stands in braces, "{identity}", see :class:`OptionError`.
         kind: noun for them, such as "corpus".
         names: to check.
         candidates: known names.
     """
     for name in names:
         if name not in candidates:
-            raise FaceDiffError(f'{source}: there is no {kind} "{name}": {choices(name, candidates)}')
+            raise OptionError.naming(f'{source}: there is no {kind} "{name}": {choices(name, candidates)}')
 
 
 def lacking(cls: object) -> str:
@@ -267,6 +267,15 @@ def needs_extra(package: str, extra: str, feature: str) -> Iterator[None]:
         yield
     except ImportError as error:
         raise MissingExtraError(package, extra, feature) from error
+
+
+@contextmanager
+def located(place: object) -> Iterator[None]:
+    """A context whose errors name a place in front, such as a file and its line."""
+    try:
+        yield
+    except FaceDiffError as error:
+        raise error.within(place) from error
 
 
 @contextmanager

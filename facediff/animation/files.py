@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, TypedDict, TypeVar
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.animation import Animation, Channels, MotionMap, stretches_of
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, located
 from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays
 from facediff.utils.files import atomic
@@ -79,7 +79,8 @@ def read_animation(
     if path.suffix == ".npz":
         animation = read_archive(path)
         facts = complete(complete(overrides, facts_of(animation)), defaults)
-        return _named(path, lambda: replace(animation, **facts))
+        with located(path):
+            return replace(animation, **facts)
     if path.suffix != ".npy":
         raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in .npz or .npy')
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused before it is used
@@ -90,15 +91,8 @@ def read_animation(
         raise OptionError.naming(f"{path}: an array has no frame rate; give {{frame_rate}} or {{checkpoint}}")
     if "template" not in facts:
         facts = {**facts, "template": np.array(vertices[0], np.float32)}
-    return _named(path, lambda: Animation(name=path.stem, vertices=vertices, **facts))
-
-
-def _named(path: Path, make: Callable[[], T]) -> T:
-    """The result of a function; errors name the file instead of the animation."""
-    try:
-        return make()
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{path}: {error}") from error
+    with located(path):
+        return Animation(name=path.stem, vertices=vertices, **facts)
 
 
 def facts_of(animation: Animation) -> AnimationFacts:
@@ -171,9 +165,11 @@ def read_archive(path: Path) -> Animation:
     parts: dict[str, Any] = {name: checked[name] for name in ARRAYS if name in checked and checked[name].size}
     values, deltas, space = parts.pop("values", None), parts.pop("deltas", None), facts.pop("space")
     if values is not None:
-        parts["channels"] = Channels(_named(path, lambda: Space.from_state(space)), values, parts["vertices"], deltas)
-    animation = _named(path, lambda: Animation(**parts, regions=regions, **facts))
-    _named(path, animation.refuse_not_finite)
+        with located(path):
+            parts["channels"] = Channels(Space.from_state(space), values, parts["vertices"], deltas)
+    with located(path):
+        animation = Animation(**parts, regions=regions, **facts)
+        animation.refuse_not_finite()
     return animation
 
 

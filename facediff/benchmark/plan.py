@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from facediff.errors import FaceDiffError, check_known, choices
+from facediff.errors import FaceDiffError, check_known, choices, located
 from facediff.utils.files import config_dir
 from facediff.utils.ranges import Range
 from facediff.utils.records import DERIVED, Items, Text, read_record
@@ -234,11 +234,9 @@ def check_scores(plan: BenchmarkPlan) -> None:
     from facediff.metrics.by_name import parse_all
     from facediff.metrics.generation import SMOOTHNESS
 
-    try:
+    with located(plan.file):
         (protocol,) = find_protocols([plan.protocol])
         parse_all(plan.metrics)
-    except FaceDiffError as error:
-        raise FaceDiffError(f"{plan.file}: {error}") from error
     check_known(f"{plan.file}: published", "table", plan.published, published())
     scores = [*(["mve"] if protocol.mve else []), "lve", *protocol.deviations(), *plan.metrics, *SMOOTHNESS, *COSTS]
     # A metric of several scores gives each its own name behind.

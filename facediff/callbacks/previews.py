@@ -32,7 +32,7 @@ from facediff.callbacks.dashboard import lip_error
 from facediff.callbacks.runs import require_facediff, run_folder
 from facediff.data import Sample, SpeechMotionDataModule, collate
 from facediff.data.corpus import Clip
-from facediff.errors import ArgumentError, FaceDiffError, MissingExtraError, choices
+from facediff.errors import MissingExtraError, check_known
 from facediff.metrics import SequenceMetric
 from facediff.metrics.base import align
 from facediff.models import AnimationModel
@@ -89,8 +89,7 @@ class SamplingPreview(Callback):
         view: str = "front",
         error_scale: Annotated[float, Range(0, above=True)] | None = None,
     ) -> None:
-        if view not in VIEWS:
-            raise ArgumentError({"view": view}, f"there is no such view: {choices(view, VIEWS)}")
+        check_known("SamplingPreview.view", "view", [view], VIEWS)
         if sampler is not None:
             registry.sampler.get(sampler)  # a wrong name is an error here, not after hours of training
         self.every_n_epochs = every_n_epochs
@@ -139,9 +138,7 @@ class SamplingPreview(Callback):
         if [callback for callback in trainer.callbacks if type(callback) is type(self)][-1] is not self:  # type: ignore[attr-defined]
             return
         clips = data.clips("val")
-        unknown = [name for name in self.names or [] if name not in {clip.name for clip in clips}]
-        if unknown:
-            raise FaceDiffError(f"SamplingPreview: {unknown[0]} is no validation clip of {data.root}; see data.clips")
+        check_known("SamplingPreview.names", "validation clip", self.names or (), [clip.name for clip in clips])
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         # DeepSpeed's strategy is a DDPStrategy, but spreads the weights over processes like FSDP.

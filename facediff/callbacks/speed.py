@@ -12,7 +12,7 @@ from torch import nn
 
 from facediff.callbacks.runs import require_facediff
 from facediff.data.dataset import CachedFeatures
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, check_known
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.hints import checks_arguments
@@ -89,13 +89,7 @@ class CompiledTraining(Callback):
         """Find the parts."""
         network = getattr(pl_module, "network", None) or nn.Module()
         modules = dict(network.named_modules())
-        for name in self.parts:
-            if name not in modules or not name:
-                children = ", ".join(child for child, _ in network.named_children()) or "none"
-                raise FaceDiffError(
-                    f'CompiledTraining.parts: {type(pl_module).__name__} has no part "{name}" in its network; its '
-                    f"parts are {children}"
-                )
+        check_known("CompiledTraining.parts", "part of the network", self.parts, [*filter(None, modules)])
         self._compiled = [modules[name] for name in self.parts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

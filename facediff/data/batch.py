@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, check_known
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.rigs import LinearRig
 from facediff.utils.hints import is_name
@@ -391,10 +391,7 @@ class Assets:
 
     def template(self, identity: str) -> Float[Tensor, "points dims"]:
         """The neutral face of an identity, in the corpus's unit."""
-        if identity not in self.templates:
-            raise OptionError(
-                "identity", f'there is no "{identity}"; the checkpoint has {", ".join(sorted(self.templates))}'
-            )
+        check_known("{identity}", "identity", [identity], self.templates)
         return self.templates[identity]
 
     def colours_of(self, identity: str) -> UInt8[Tensor, "vertices 3"] | None:

@@ -47,7 +47,7 @@ from facediff.data.measuring import measure_components, measure_scale, measure_w
 from facediff.data.mixing import mixed_loader
 from facediff.data.packed.stores import address_of, is_packed
 from facediff.data.storage import ChannelFolder, ClipStorage
-from facediff.errors import ArgumentError, FaceDiffError, choices, damaged
+from facediff.errors import ArgumentError, FaceDiffError, check_known, damaged
 from facediff.hyperparameters import keeps_arguments, plain, read_options
 from facediff.registry import corpus as corpora
 from facediff.registry import find_class
@@ -227,10 +227,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
                 f"data.people: {duplicates[0]} occurs more than once among the corpus's identities, imported speakers "
                 f"and data.extra_identities; import the speaker under a new name, or omit one"
             )
-        if unknown := [name for name in self.train_identities or [] if name not in self.identities]:
-            raise ArgumentError(
-                {"train_identities": unknown[0]}, f"no such identity: {choices(unknown[0], self.identities)}"
-            )
+        check_known("data.train_identities", "identity", self.train_identities or (), self.identities)
         self.features = FeatureSlot()
         self.projection = ProjectionSlot()  # a model's choice, see its training_projection
         self.pair_sentences = False
@@ -733,13 +730,10 @@ def by_speaker(clips: Iterable[Clip]) -> dict[str, list[Clip]]:
 
 def split_in_table(clip: Clip) -> str | None:
     """The split that ``clips.csv`` states for a clip; ``test`` is test A, ``none`` and ``references`` are no split."""
-    splits: dict[str | None, str | None] = {"test": "test_a", "none": None, "references": None}
+    splits: dict[str, str | None] = {"test": "test_a", "none": None, "references": None}
     splits |= {split: split for split in get_args(Split)}
-    split = clip.attributes.get("split")
-    if split not in splits:
-        raise FaceDiffError(
-            f"{clip.root / 'clips.csv'}: split of {clip.name} is {split!r}; expected train, val, test or none"
-        )
+    split = clip.attributes.get("split", "")
+    check_known(f"{clip.root / 'clips.csv'}: {clip.name}", "split", [split], splits)
     return splits[split]
 
 

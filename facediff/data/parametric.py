@@ -17,7 +17,7 @@ from facediff.data.datamodule import SpeechMotionDataModule, by_speaker, split_i
 from facediff.data.packed.stores import is_packed
 from facediff.data.person.importer import splits
 from facediff.data.recordings import USUAL_SUFFIXES, RecordingFolder
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, check_known
 from facediff.spaces import Space, layout
 from facediff.spaces.layouts import LAYOUTS
 from facediff.utils.licences import Commercial
@@ -258,8 +258,7 @@ class FlameClips(ParametricDataModule):
 
     def __init__(self, *, root: str, layout: str, version: str = "", **options: Any) -> None:  # noqa: ANN401
         flame = [name for name, entry in LAYOUTS.items() if entry.space.kind == "flame"]
-        if layout not in flame:
-            raise FaceDiffError(f"data.layout: is {layout!r}; expected one of {', '.join(flame)}")
+        check_known("data.layout", "layout of FLAME", [layout], flame)
         self.space = replace(LAYOUTS[layout].space, version=version)
         self.layout_name = layout
         self.n_vertices = len(self.space.channels)

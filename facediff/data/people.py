@@ -11,7 +11,7 @@ from facediff import registry
 from facediff.data.corpus import Clip, read_clip_table, read_manifest
 from facediff.data.datamodule import SpeechMotionDataModule, person_licence
 from facediff.data.packed.stores import is_packed
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, check_known
 from facediff.utils.licences import Licence, merged, read_licences
 from facediff.utils.ranges import Range
 
@@ -96,11 +96,7 @@ class People(SpeechMotionDataModule):
     @cached_property
     def _splits(self) -> dict[str, str | None]:
         table = {name: row.get("split", "none") for name, row in read_clip_table(self.root).items()}
-        unknown = {*table.values()} - {"train", "val", "test", "none"}
-        if unknown:
-            raise FaceDiffError(
-                f"{self.root / 'clips.csv'}: has a split {min(unknown)!r}; expected train, val, test or none"
-            )
+        check_known(self.root / "clips.csv", "split", table.values(), ("train", "val", "test", "none"))
         by_person: dict[str, list[str]] = {}
         for clip in self.corpus.clips.values():
             if clip.root == self.root:

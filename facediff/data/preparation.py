@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.manifest import FORMAT, load_manifest
-from facediff.errors import FaceDiffError, choices, damaged, needs_extra
+from facediff.errors import FaceDiffError, check_known, damaged, needs_extra
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import begin_folder, run_batch
 from facediff.utils.checksums import describe_files, same_sizes
@@ -411,9 +411,7 @@ def find_regions(raw: Path, regions: Path | None) -> list[Path]:
 
 def choose_subjects(subjects: Sequence[str] | None, available: Sequence[str], holder: str) -> list[str]:
     """The subjects that ``--subjects`` names, in the order in which they are known; all if None."""
-    for subject in subjects or ():
-        if subject not in available:
-            raise FaceDiffError(f'--subjects: {holder} has no "{subject}": {choices(subject, available)}')
+    check_known("--subjects", f"subject of {holder}", subjects or (), available)
     return [subject for subject in available if subjects is None or subject in subjects]
 
 

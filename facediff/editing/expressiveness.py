@@ -14,7 +14,7 @@ from facediff.animation.animation import allocate_like
 from facediff.animation.options import Scales, scales_text
 from facediff.editing.eyelids import Array, Eyes, Indices
 from facediff.editing.procedural import EDITED, in_words, with_metadata
-from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.errors import OptionError, check_known
 from facediff.utils.hints import Range, read
 from facediff.utils.numerics import nearest_distances, smooth_step
 
@@ -59,9 +59,7 @@ def read_factors(scales: Scales | None, option: str = "expressiveness", highest:
 
 def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], name: str) -> None:
     """Refuse a region that the face called ``name`` does not have."""
-    for region in factors:
-        if region != ALL and region not in regions:
-            raise FaceDiffError(f'{name}: has no region "{region}": {choices(region, [*regions, ALL])}')
+    check_known(name, "region", factors, [*regions, ALL])
 
 
 def scale_regions(

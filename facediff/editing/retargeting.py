@@ -32,7 +32,7 @@ from facediff.editing.lid_transfer import swing, with_lids, without_lids
 from facediff.editing.placing import place_face
 from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface
-from facediff.errors import FaceDiffError, OptionError, damaged
+from facediff.errors import FaceDiffError, OptionError, damaged, located
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.parts import mesh_parts, named_triangles
@@ -106,12 +106,10 @@ def retarget(
     face_triangles = named_triangles(mesh_path, parts) if parts else None
 
     def attempt(marks: Landmarks | None) -> tuple[Animation, Correspondence]:
-        try:
+        with located(mesh_path):
             correspondence = correspond(
                 animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, face_triangles=face_triangles
             )
-        except FaceDiffError as error:
-            raise FaceDiffError(f"{mesh_path}: {error}") from error
         return checked_transfer(correspondence)
 
     try:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, located
 from facediff.registry import render_metric
 from facediff.render.rasteriser import Camera, Renderer, portrait
 from facediff.runtime.graphs import open_session, run_session
@@ -290,10 +290,8 @@ class RenderScorer:
                 pictures[key] = np.stack([renderer.render(frame) for frame in vertices])
             speech = self.speech(clip)
             speech = speech[: int(len(vertices) / self.frame_rate * SAMPLE_RATE + 1e-6)]
-            try:
+            with located(f"--render {name}: {clip}"):
                 values = metric.score(pictures[key], speech, self.frame_rate)
-            except FaceDiffError as error:
-                raise FaceDiffError(f"--render {name}: {clip}: {error}") from error
             scores |= {f"{name}/{score}": value for score, value in values.items()}
         return scores
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from facediff import registry
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions
-from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choices
+from facediff.errors import FaceDiffError, MissingExtraError, OptionError, check_known
 from facediff.export.fbx import refuse_without_blender, write_fbx
 from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
@@ -157,8 +157,7 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         refuse_without_blender(path)
         check_writable(path)
         path, suffix = path.with_suffix(".glb"), ".glb"
-    if suffix not in FORMATS:
-        raise FaceDiffError(f'{path}: there is no format "{suffix}": {choices(suffix.lower(), FORMATS)}')
+    check_known(path, "format", [suffix], FORMATS)
     form = FORMATS[suffix]
     metres = 1.0 if options.output_unit is None else metres_per_unit(options.output_unit)
     reason = ""

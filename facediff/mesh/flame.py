@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices, damaged
+from facediff.errors import FaceDiffError, check_known, damaged
 from facediff.utils.arrays import read_arrays
 from facediff.utils.pickles import StandIn, load_pickle
 
@@ -307,9 +307,7 @@ def read_masks(path: Path, names: str) -> list[int]:
             first, *rest = [part] if part in content else part.split("-")
             included.append(first)
             excluded += rest
-        for name in [*included, *excluded]:
-            if name not in content:
-                raise FaceDiffError(f'{path}: has no mask "{name}": {choices(name, list(map(str, content)))}')
+        check_known(path, "mask", [*included, *excluded], [*map(str, content)])
         masks = [content[name] for name in [*included, *excluded]] if names else [content]
         arrays = [np.asarray(mask) for mask in masks]
         if any(array.ndim != 1 or not np.issubdtype(array.dtype, np.integer) for array in arrays):

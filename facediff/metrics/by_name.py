@@ -15,7 +15,7 @@ from typing import Any, cast
 import torch
 from torchmetrics import Metric
 
-from facediff.errors import FaceDiffError, choices, damaged
+from facediff.errors import FaceDiffError, check_known, damaged
 from facediff.metrics.base import INTERNAL, SequenceMetric
 from facediff.metrics.channels import Moment, split_frames
 from facediff.metrics.regions import Region
@@ -121,8 +121,7 @@ class Request:
             regions = {need: value for need in ("lips", "upper_face") for value in context.has.get(need, {}).values()}
             if getattr(implementation, "of_channels", False):
                 regions = dict(context.channels)
-            if region not in regions:
-                raise FaceDiffError(f"metric {self.text}: there is no region {region!r}: {choices(region, regions)}")
+            check_known(f"metric {self.text}", "region", [region], regions)
             options["region"] = regions[region]
         with damaged(f"metric {self.text}", "change its options"):
             return cast(Metric, implementation(**arguments | options))

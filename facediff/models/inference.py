@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
-from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import LOW_LATENCY, FrameClock, MotionWindow, SpeechWindows, WindowPlan
@@ -249,10 +249,8 @@ class Inference(ABC):
 
     def check_condition(self, condition: str | None) -> None:
         """Refuse to be conditioned on a speaker that the model was not trained on."""
-        if condition is not None and condition not in self.assets.identities:
-            raise FaceDiffError(
-                f'condition: the model was not trained on "{condition}": {choices(condition, self.assets.identities)}'
-            )
+        known_identities = self.assets.identities
+        check_known("{condition}", "trained identity", [] if condition is None else [condition], known_identities)
 
     def clip_of(
         self,

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from facediff.errors import ArgumentError, FaceDiffError, choices
+from facediff.errors import ArgumentError, check_known
 from facediff.models.layers import Share
 from facediff.registry import sampler
 from facediff.utils.ranges import Range
@@ -84,8 +84,7 @@ class NoiseProcess:
         scale: float = 1.0,
         variances: Float[Tensor, " steps"] | None = None,
     ) -> None:
-        if schedule not in SCHEDULES:
-            raise FaceDiffError(f'noise_schedule: there is no schedule "{schedule}": {choices(schedule, SCHEDULES)}')
+        check_known("noise_schedule", "schedule", [schedule], SCHEDULES)
         self.steps = steps if variances is None else len(variances)
         self.schedule = schedule
         self.variances: Tensor = SCHEDULES[schedule](steps) if variances is None else variances

@@ -23,7 +23,7 @@ from facediff.animation.options import (
     with_options,
 )
 from facediff.editing.controls import keys_of, refuse_folder
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options, direction_for
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
@@ -614,8 +614,7 @@ def precision_of(dtype: DType) -> Literal["32", "bf16"]:
         'bf16'
     """
     name = str(dtype).removeprefix("torch.")
-    if name not in PRECISIONS:
-        raise FaceDiffError(f"dtype {name}: expected {' or '.join(PRECISIONS)}")
+    check_known("dtype", "precision", [name], PRECISIONS)
     return PRECISIONS[name]
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from facediff.editing.direction import Direction, Key, curve, text_shares
 from facediff.editing.expressiveness import ALL, region_weights
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, located
 from facediff.models.inference import Progress, SpeechStream
 from facediff.models.styles import style_from
 from facediff.speech.windows import in_parts
@@ -133,10 +133,10 @@ def plan_runs(
         alternatives.append([(name, value, Share(keys, value, numbers)) for value in values])
     expressive = _expressivity(direction, model, identity)
     alternatives += [expressive] if expressive else []
-    styles = {
-        text: _named(direction, "style", lambda text=text: style_from(text, identity, model, template=style_template))
-        for text in dict.fromkeys(str(key.value) for key in direction.channels.get("style", ()))
-    }
+    styles = {}
+    for text in dict.fromkeys(str(key.value) for key in direction.channels.get("style", ())):
+        with located(f"{direction.source}: channel style"):
+            styles[text] = style_from(text, identity, model, template=style_template)
     last = max(key.time for key in direction.keys)
     times = np.arange(int(np.ceil(last * model.frame_rate)) + 2) / model.frame_rate
     runs: list[ConditionedRun] = []
@@ -158,25 +158,18 @@ def plan_runs(
         with model.choosing():
             settings = {name: value for name, value, _ in combination}
             for name, value in settings.items():
-                if name.startswith("guidance."):
-                    scales = {name.partition(".")[2]: float(value)}
-                    _named(direction, name, lambda scales=scales: model.choose_guidance(scales))
-                elif name == "expressivity":
-                    _named(direction, name, lambda value=value: model.choose_expressivity(value))
+                with located(f"{direction.source}: channel {name}"):
+                    if name.startswith("guidance."):
+                        model.choose_guidance({name.partition(".")[2]: float(value)})
+                    elif name == "expressivity":
+                        model.choose_expressivity(value)
             run_condition = str(settings["condition"]) if "condition" in settings else condition
-            _named(direction, "condition", lambda run_condition=run_condition: model.check_condition(run_condition))
+            with located(f"{direction.source}: channel condition"):
+                model.check_condition(run_condition)
             runs.append(
                 ConditionedRun(styles.get(str(settings.get("style")), style), run_condition, model.choices(), shares)
             )
     return runs
-
-
-def _named(direction: Direction, channel: str, step: Any) -> Any:  # noqa: ANN401
-    """The result of a step; its error names the file and the channel."""
-    try:
-        return step()
-    except FaceDiffError as error:
-        raise error.within(f"{direction.source}: channel {channel}") from error
 
 
 def _expressivity(
@@ -190,10 +183,8 @@ def _expressivity(
     keys = next(iter(channels.values()))
     template = model.assets.template(identity).numpy()
     regions = {name: np.asarray(indices, np.int64) for name, indices in model.assets.regions.items()}
-    try:
+    with located(f"{direction.source}: channel expressivity"):
         weights = region_weights(template, regions, list(constants), f"the checkpoint's corpus {model.assets.corpus}")
-    except FaceDiffError as error:
-        raise error.within(f"{direction.source}: channel expressivity") from error
     if None not in constants.values():
         factors = {name: float(value) for name, value in constants.items() if value is not None}
         is_uniform = {*factors} == {ALL}

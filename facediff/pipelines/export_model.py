@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.style_files import Stillness, stillness_of
-from facediff.errors import FaceDiffError, MissingExtraError, OptionError, choices
+from facediff.errors import FaceDiffError, MissingExtraError, check_known
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, packed_deltas, read_folder
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic_folder
@@ -86,9 +86,7 @@ def export_model(
     _ = with_rig(model.assets).mesh  # refused before graphs are recorded, which takes a minute
     graphs = model.graphs()
     known_identities = list(model.assets.templates)
-    for name in identities or ():
-        if name not in known_identities:
-            raise OptionError("identities", f'there is no "{name}": {choices(name, known_identities)}')
+    check_known("{identities}", "identity", identities or (), known_identities)
     whose = known_identities if identities is None else [name for name in known_identities if name in set(identities)]
     with atomic_folder(folder) as staged:
         sizes, described = {}, {}

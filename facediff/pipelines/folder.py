@@ -16,7 +16,7 @@ import numpy as np
 from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.animation.style_files import style_paths
 from facediff.editing.controls import keys_file
-from facediff.errors import FaceDiffError, OptionError, choices, printable
+from facediff.errors import FaceDiffError, OptionError, check_known, printable
 from facediff.export import FORMATS, check_export
 from facediff.pipelines.animate import check_directed, check_options
 from facediff.pipelines.trained import open_pipeline
@@ -75,8 +75,7 @@ def animate_folder(
     Returns:
         the exit status: 0 if all animations are there, 1 if a recording failed.
     """
-    if suffix not in FORMATS:
-        raise OptionError("suffix", f"there is no such format: {choices(suffix, FORMATS)}", suffix)
+    check_known("{suffix}", "format", [suffix], FORMATS)
     if output.suffix in FORMATS and not output.is_dir():
         raise OptionError(
             "output", f"several recordings go into a folder; give its name, and {{suffix}} {output.suffix}", output

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.runtime.audio2face_folder import REMEDY, SAMPLE_RATE, Audio2FaceFolder, read_audio2face
 from facediff.runtime.graphs import open_session, run_session
 from facediff.utils.hints import check_number
@@ -106,9 +106,8 @@ class Audio2Face:
         """
         names = self.folder.facts.emotions
         explicit = np.array(self.folder.facts.default_emotion, np.float32)
+        check_known("emotion", "emotion", strengths or (), names)
         for name, strength in (strengths or {}).items():
-            if name not in names:
-                raise FaceDiffError(f'emotion: there is no "{name}": {choices(name, names)}')
             explicit[names.index(name)] = check_number("emotion", name, strength, -10, 10)
         return np.concatenate([self.folder.implicit, explicit])
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import WITHOUT_FACE
-from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.runtime.folder import Arrays, Description, decoder_of
 from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.sampling import NAME, RuntimeChoices, RuntimeConditions, WindowSpeech, clip_motion, window_motion
@@ -173,13 +173,9 @@ class RuntimeModel(ExportedGraphs):
         """The face's place among the templates, and the conditions of its motion."""
         about, style = self.description, choice.style
         identity = about.known[0] if choice.identity is None else choice.identity
-        if identity not in about.faces:
-            raise OptionError("identity", f'there is no "{identity}": {choices(identity, about.faces)}')
-        if choice.condition is not None and choice.condition not in about.identities:
-            raise OptionError(
-                "condition",
-                f'the model was not trained on "{choice.condition}": {choices(choice.condition, about.identities)}',
-            )
+        check_known("{identity}", "identity", [identity], about.faces)
+        if choice.condition is not None:
+            check_known("{condition}", "trained identity", [choice.condition], about.identities)
         conditioned_on = identity if choice.condition is None else choice.condition
         vector = RuntimeStyle(conditioned_on, np.zeros(0, np.float32))
         if about.style_source == "reference":
@@ -190,8 +186,7 @@ class RuntimeModel(ExportedGraphs):
             # The model's identities are its styles, if it has any: the one that it is conditioned on is the style.
             if about.style_source == "none":
                 raise OptionError("style", f"{about.model} knows no speaking styles; omit the option")
-            if str(style) not in about.styles:
-                raise OptionError("style", f'there is no "{style}": {choices(str(style), about.styles)}')
+            check_known("{style}", "style", [str(style)], about.styles)
             conditioned_on = str(style)
             vector = RuntimeStyle(conditioned_on, vector.vector)
         for option, value, kind in (("seed", choice.seed, Seed), ("expressivity", choice.expressivity, Expressivity)):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import check_known
 from facediff.spaces.arkit import ALPHABETICAL, ARKIT, ROTATIONS, left_first
 from facediff.spaces.space import Form, Joint, Kind, Rotation, Space
 
@@ -175,8 +175,7 @@ def find_layout(name: str, where: str = "layout") -> Layout:
         name: the layout's name.
         where: name of the option or file, for messages.
     """
-    if name not in LAYOUTS:
-        raise FaceDiffError(f'{where}: there is no layout "{name}"; {choices(name, LAYOUTS)}')
+    check_known(where, "layout", [name], LAYOUTS)
     return LAYOUTS[name]
 
 

@@ -137,7 +137,7 @@ def test_bad_options(
     np.save("far.npy", np.full((9, 24, 3), 0.5, np.float32))
     before = sorted(tmp_path.rglob("*"))
     for words, sentence in (
-        ("--identity Zoe", '--identity: there is no "Zoe"; the checkpoint has A, B, C'),
+        ("--identity Zoe", '--identity: there is no identity "Zoe": known are A, B, C'),
         ("--style other.npy", "has shape (9, 31, 3); the model's faces have 24 vertices"),
         ("--style far.npy", "it is not A's"),
         ("--style A_e99", "no clip of that name"),

@@ -144,7 +144,7 @@ def test_what_does_not_fit_is_one_sentence(
     before = sorted(corpus.parent.rglob("*"))
     for wrong, message in (
         ("frames --clip A_e66", 'did you mean "A_e06"'),
-        ("lips --clip B_e01", 'ours has no clip "B_e01"'),
+        ("lips --clip B_e01", 'ours: there is no clip "B_e01"'),
         ("frames --phonemes z", "in clip A_e06: known are m, ɑː, f"),
         ("frames --times 0.1", "either --times or --phonemes"),
         ("error --mesh other.ply", "has 4 vertices, the motion 24"),

@@ -115,7 +115,7 @@ def test_animate_is_seeded_and_knows_unseen_people(model: DualPathDiffusion) -> 
     assert torch.equal(first.vertices, model.animate(speech, identity="A", seed=1).vertices)
     assert not torch.equal(first.vertices, model.animate(speech, identity="A", seed=2).vertices)
     assert model.animate(speech, identity="C").identity == "unknown"
-    with pytest.raises(FaceDiffError, match='there is no "Z"; the checkpoint has A, B, C'):
+    with pytest.raises(FaceDiffError, match='there is no identity "Z": known are A, B, C'):
         model.animate(speech, identity="Z")
 
 

@@ -242,7 +242,7 @@ def test_style_comes_from_a_file_or_a_mixture(model: AnimationModel, folder: Pat
         read_style(str(tmp_path / "another.npy"), runtime, "A")
     with pytest.raises(OptionError) as caught:
         read_style("Zoe", runtime, "A")
-    assert caught.value.on_command_line.startswith('--style: there is no "Zoe"')
+    assert caught.value.on_command_line.startswith('--style: there is no style "Zoe"')
     for name in ("b.npz", "B_1.npy", "vector.npy", "marked.npy"):
         found = read_style(str(tmp_path / name), runtime, "A")
         np.testing.assert_allclose(found.vector, own, atol=1e-5)
@@ -335,7 +335,7 @@ def test_a_folder_with_further_styles_alone_is_compared(tmp_path: Path, monkeypa
 @pytest.mark.slow
 def test_faces_and_styles_of_some_identities_are_exported(tiny_root: Path, tmp_path: Path) -> None:
     made = ready(tiny_root)
-    with pytest.raises(FaceDiffError, match='identities: there is no "nobody"'):
+    with pytest.raises(FaceDiffError, match='identities: there is no identity "nobody"'):
         export_model(made, tmp_path / "out", identities=["nobody"])
     description = export_model(made, tmp_path / "out", identities=["B"])
     assert description.faces == ["B"]

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from torch import Tensor
 
 from facediff.data.corpus import ALL
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known, choices
 from facediff.evaluation.files import (
     DEFAULT_PATTERNS,
     OWN,
@@ -95,10 +95,8 @@ class FigureData:
                 f"{' and '.join(self.names)} have no clip in common; the truth has {few(self.truths)}; "
                 f"give --pattern and --truth-pattern, which say how files are named"
             )
-        for clip in clips:
-            for name, files in sets.items():
-                if clip not in files:
-                    raise FaceDiffError(f'{name} has no clip "{clip}": {few(files, clip)}')
+        for name, files in sets.items():
+            check_known(name, "clip", clips, files)
         return list(dict.fromkeys(clips))
 
     def open(self, clip: str) -> dict[str, Tensor]:

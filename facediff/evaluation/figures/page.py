@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.reporting.drawing import FONT, GREY, SMALLEST_TEXT, TEXT, drawing_settings, matplotlib, plain
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
@@ -68,8 +68,7 @@ def style(paper: Paper) -> Iterator[None]:
     from matplotlib import font_manager
 
     fonts = sorted(set(font_manager.get_font_names()))
-    if paper.font not in fonts:
-        raise FaceDiffError(f'--font: there is no "{paper.font}": {choices(paper.font, fonts)}')
+    check_known("--font", "font", [paper.font], fonts)
     with drawing_settings(paper.font):
         yield
 

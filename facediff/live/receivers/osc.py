@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
@@ -100,8 +100,7 @@ class Vmc(_Osc):
 
     def __init__(self, address: Address, *, names: str = "perfect_sync") -> None:
         super().__init__(address)
-        if names not in NAMES:
-            raise FaceDiffError(f"{OPTION} {self.name}: names is {names!r}; {choices(names, NAMES)}")
+        check_known(f"{OPTION} {self.name}: names", "choice", [names], NAMES)
         self._vrm = names == "vrm"
         arkit = [live_link_name(name) for name in ARKIT] if names == "perfect_sync" else ARKIT
         labels = SETS["vrm"] if self._vrm else arkit

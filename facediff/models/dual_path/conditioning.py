@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.dual_path.speech_style import SpeechStyle
@@ -284,9 +284,8 @@ class ConditionedModel(AnimationModel):
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
         """Follow conditions more (above 1) or less from now on; checkpoints keep the original scales."""
+        check_known("guidance", "condition", scales, CONDITIONS)
         for name, scale in scales.items():
-            if name not in CONDITIONS:
-                raise FaceDiffError(f'guidance: there is no condition "{name}": {choices(name, CONDITIONS)}')
             if (expected := mismatch(ranges.GuidanceScale, scale)) is not None:
                 raise FaceDiffError(f"guidance: {name}={scale} is out of range; expected {expected}")
             if scale != 1 and name not in self.guidable:

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, OptionError, choices
+from facediff.errors import ArgumentError, OptionError, check_known
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
 from facediff.models.layers import Heads, Layers, Share, Width, check_heads
@@ -190,9 +190,7 @@ class DiffPoseTalk(ParametricModel):
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
         """Follow speech (``audio``) or ``style`` by other scales."""
-        for name in scales:
-            if name not in self.guiding:
-                raise OptionError.naming(f"{{guidance}} {name}: expected {choices(name, list(self.guiding))}")
+        check_known("{guidance}", "condition", scales, self.guiding)
         self.scales = {**self.scales, **scales}
 
     # The style of a clip.

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import OptionError, choices
+from facediff.errors import check_known
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.base import Decay
 from facediff.models.folding import Fold, SamplingSpace, WeightCache
@@ -125,10 +125,7 @@ class DiffSpeaker(DiffusionModel):
             name: ``ddim`` for DDIM as its paper has it; the present scheduler if None.
             steps: denoising steps; the present number if None.
         """
-        if name is not None and name not in self.samplers:
-            raise OptionError.naming(
-                f"{{sampler}} {name}: DiffSpeaker has no such sampler: {choices(name, self.samplers)}"
-            )
+        check_known("{sampler}", "sampler of DiffSpeaker", [] if name is None else [name], self.samplers)
         self.scheduler = "ddim" if name == "ddim" else self.scheduler
         self.sampling_steps = self.sampling_steps if steps is None else steps
         _ = self.sampler  # refuses a number of steps that the process has not

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, SpeechMotionDataModule
-from facediff.errors import FaceDiffError, OptionError, choices
+from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import BatchMotion, Progress, Style, with_speech
@@ -352,8 +352,7 @@ def space_of(name: str) -> Space:
 def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
     """The chosen data set's frame rate, speakers and neutral face."""
     data_sets, name = files.card.data, options.dataset or DEFAULT
-    if name not in data_sets:
-        raise OptionError.naming(f"{{dataset}} {name}: UniTalker has no such data set: {choices(name, data_sets)}")
+    check_known("{dataset}", "data set of UniTalker", [name], data_sets)
     data, rows = data_sets[name], files.size(TABLE, 0)
     # A checkpoint with another number of rows was trained on one data set alone.
     single = rows != sum(entry["speakers"] for entry in data_sets.values()) + 1

@@ -240,7 +240,9 @@ def test_speakers_that_are_not_there_are_named(raw: Path, flame: Path) -> None:
     assert "M003" not in absent
     assert "M003" in mead3d.plan(raw, flame=flame, subjects=["M003"]).options["subjects"]
     assert not [key for key in mead3d.plan(raw, flame=flame, subjects=["M003"]).missing if len(key) == 4]
-    with pytest.raises(FaceDiffError, match=r'--subjects: the raw folder has no "M03": did you mean "M003"'):
+    with pytest.raises(
+        FaceDiffError, match=r'--subjects: there is no subject of the raw folder "M03": did you mean "M003"'
+    ):
         mead3d.plan(raw, flame=flame, subjects=["M03"])
 
 

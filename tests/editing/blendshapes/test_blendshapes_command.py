@@ -158,7 +158,7 @@ def test_shapes_of_another_topology_are_carried(
         (["nan.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "frame 1 holds NaN"),
         (["small.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25"], "1008 vertices and the"),
         (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--bounds", "1", "0"], "bounds 1 to 0"),
-        (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--region", "lips"], "has no region"),
+        (["take.npz", "-o", "w.csv", "--shapes", "shapes", "--region", "lips"], 'there is no region "lips"'),
         (["take.npz", "-o", "mine.csv", "--shapes", "shapes"], "mine.json: is a file that facediff did not write"),
         (["bare.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25", "--show", "a.png"], "without a mesh"),
         (["take.npz", "--write-puppet-shapes", "new"], "has no effect with animation; omit it"),

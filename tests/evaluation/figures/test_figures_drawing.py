@@ -199,7 +199,7 @@ def test_the_grid_leaves_room_for_its_labels() -> None:
 
 
 def test_fonts(tmp_path: Path) -> None:
-    with pytest.raises(FaceDiffError, match=r'--font: there is no "DejaVu Sanss": did you mean "DejaVu Sans'):
+    with pytest.raises(FaceDiffError, match=r'--font: there is no font "DejaVu Sanss": did you mean "DejaVu Sans'):
         draw_training(RUNS, ["val/lve"], tmp_path / "a.png", paper=Paper(font="DejaVu Sanss"))
     assert list(tmp_path.iterdir()) == []
 

@@ -50,7 +50,7 @@ def test_choosing_clips(own_material: FigureData, tiny_root: Path, methods: dict
     assert own_material.choose(["B_e06", "B_e06"]) == ["B_e06"]
     with pytest.raises(FaceDiffError, match=r'no clip "A_e66".*did you mean "A_e06"'):
         own_material.choose(["A_e66"])
-    with pytest.raises(FaceDiffError, match=r'ours has no clip "C_e06"'):
+    with pytest.raises(FaceDiffError, match=r'ours: there is no clip "C_e06"'):
         own_material.choose(["C_e06"])
     for other in ({"truth": methods["ours"]}, {"none": tmp_path}, {"gone": tmp_path / "gone"}):
         with pytest.raises(FaceDiffError):
