@@ -198,6 +198,18 @@ class OptionError(FaceDiffError):
         return partial(OptionError, location=self.place), (self._in_front, self.problem, value)
 
 
+def refuse_idle(reason: str, **options: bool) -> None:
+    """Refuse options without an effect, such as options of batches for one recording.
+
+    Args:
+        reason: where the options have an effect, as in "is for one recording"; other options in it stand in braces.
+        options: whether an option was given, by its name.
+    """
+    for name, is_given in options.items():
+        if is_given:
+            raise OptionError(name, f"{reason}; omit it")
+
+
 class ArgumentError(FaceDiffError, ValueError):
     """A constructor's argument has an impossible value, or one that does not go with another argument's.
 

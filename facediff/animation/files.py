@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.animation import Animation, Channels, MotionMap, stretches_of
-from facediff.errors import FaceDiffError, OptionError, located
+from facediff.errors import FaceDiffError, OptionError, check_known, located
 from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays
 from facediff.utils.files import atomic
@@ -81,8 +81,7 @@ def read_animation(
         facts = complete(complete(overrides, facts_of(animation)), defaults)
         with located(path):
             return replace(animation, **facts)
-    if path.suffix != ".npy":
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a motion in .npz or .npy')
+    check_known(path, "format of a motion", [path.suffix], (".npz", ".npy"))
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused before it is used
         stored = open_vertices(path)
         vertices = stored.view(MotionMap) if stored.dtype == np.float32 else stored.astype(np.float32)

@@ -13,7 +13,7 @@ from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder, prepared
 from facediff.cli.options import Checkpoint, CheckpointFile, Corpus, Folder, Seed
 from facediff.cli.process import confirm_cost, tell
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils import ranges
 from facediff.utils.hub import check_model_source, model_name
 from facediff.utils.option import Option
@@ -149,8 +149,7 @@ def adapt(
         )
     else:
         train = training.train or ("all" if face is None else "head")
-        if train == "head" and face is None:
-            raise FaceDiffError("--train head: is for --face; give all or person")
+        refuse_idle("head is for {face}", train=train == "head" and face is None)
         training = replace(training, train=train)
         report = train_on(checkpoint, output, person, face, where, training, licence, accelerator, seed, quiet=quiet)
     tell(f"{output}: {report.format(seconds=time.monotonic() - started)}")

@@ -18,9 +18,9 @@ from facediff.animation.options import (
     WindowOptions,
 )
 from facediff.cli.options import Scheduler, Workers
-from facediff.cli.parsing import changed, refuse_idle
+from facediff.cli.parsing import changed
 from facediff.cli.process import confirm_cost, tell
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils import ranges
 from facediff.utils.files import example_recording, holds_glb
 from facediff.utils.hub import check_animating_source, model_or_bundled

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import SourceOptions, Tracks
 from facediff.cli.options import FrameRate, Picture, check_source
-from facediff.cli.parsing import changed, refuse_idle
+from facediff.cli.parsing import changed
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, counted
+from facediff.errors import FaceDiffError, counted, refuse_idle
 from facediff.utils import ranges
 from facediff.utils.option import Option
 

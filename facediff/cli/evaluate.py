@@ -17,8 +17,8 @@ from facediff.cli.options import (
     Workers,
     named_folders,
 )
-from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import confirm_cost, tell
+from facediff.errors import refuse_idle
 from facediff.utils import ranges
 from facediff.utils.option import Option
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from facediff.cli.options import File, NewFolder
-from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
+from facediff.errors import refuse_idle
 from facediff.utils import ranges
 from facediff.utils.hub import BUNDLED, bundled_by_name, model_or_bundled
 from facediff.utils.option import Option
@@ -70,8 +69,9 @@ def export_model(
     if sampler is not None or steps is not None:
         loaded.choose_sampler(sampler, steps)
     if quick_steps is not None:
-        if loaded.low_latency_steps is None:
-            raise FaceDiffError(f"--quick-steps: {type(loaded).__name__} keeps its steps at low latency; omit it")
+        refuse_idle(
+            f"{type(loaded).__name__} keeps its steps at low latency", quick_steps=loaded.low_latency_steps is None
+        )
         loaded.low_latency_steps = quick_steps
     tell(f"recording the graphs of {type(loaded).__name__}, which takes a minute …")
     description = export(loaded, output, precision=weights, speech=samples, identities=identities)

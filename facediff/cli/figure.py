@@ -17,9 +17,8 @@ from facediff.cli.options import (
     Workers,
     named_folders,
 )
-from facediff.cli.parsing import refuse_idle
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils import ranges
 from facediff.utils.option import Option
 

@@ -341,8 +341,6 @@ def fresh_component(flag: str, value: str) -> str:
         return f"facediff.registry.{kind.kind}.{value}"
     if kind is None or not re.fullmatch(r"[a-z]\w*", value) or Path(value).is_file() or value == "null":
         return value
-    if value not in kind.names():
-        raise FaceDiffError(kind.unknown(value))
     return json.dumps(
         {"class_path": f"facediff.registry.{kind.kind}.{value}", "init_args": plain(defaults(kind.get(value)))}
     )

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
 from facediff.cli.paths import check_paths
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, refuse_idle
 from facediff.utils.hints import Range, extras_of, range_of, read, shown
 from facediff.utils.option import Option
 
@@ -321,18 +321,6 @@ def refuse_ineffective(parameters: Sequence[Parameter], values: Mapping[str, Any
             refuse_idle(f"has no effect without {flags}", **{parameter.name: True})
         for name in excluding:
             refuse_idle(f"has no effect with {present[name].flag}", **{parameter.name: True})
-
-
-def refuse_idle(reason: str, **options: bool) -> None:
-    """Refuse options without an effect, such as options of batches for one recording.
-
-    Args:
-        reason: where the options have an effect, as in "is for one recording".
-        options: whether an option was given, by its name.
-    """
-    for name, is_given in options.items():
-        if is_given:
-            raise FaceDiffError(f"--{name.replace('_', '-')}: {reason}; omit it")
 
 
 def changed(options: Any) -> dict[str, bool]:  # noqa: ANN401 - an instance of a dataclass

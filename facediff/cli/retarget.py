@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import SourceOptions
 from facediff.cli.options import Map, Output, PageServer, Picture, check_source
-from facediff.cli.parsing import changed, refuse_idle
+from facediff.cli.parsing import changed
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils.files import check_writable, holds_glb
 from facediff.utils.option import Option
 

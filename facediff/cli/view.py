@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from facediff.animation.options import SourceOptions
 from facediff.cli.options import Animations, check_source, with_different_names
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, counted
+from facediff.errors import counted
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -47,10 +47,6 @@ def view(
     """
     paths = [*([] if truth is None else [truth]), *animations]
     check_source(source)
-    if labels is not None and len(labels) != len(paths):
-        raise FaceDiffError(
-            f"--labels: {len(labels)} names for {len(paths)} panels; give one for each, the truth's first"
-        )
 
     from facediff.pipelines.motion import view as page_of
 

@@ -13,7 +13,7 @@ from facediff.animation import Animation, metres_per_unit
 from facediff.editing.bounded import Problem, minimise, minimise_sparse
 from facediff.editing.expressiveness import ALL, check_factors
 from facediff.editing.shapes import BUILT_IN, ShapeSet, read_shapes
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.mesh.mesh import triangle_areas
 from facediff.spaces.arkit import ARKIT, absent_from, beyond_arkit, mirror_pairs
 from facediff.spaces.files.clips import ParameterClip
@@ -561,8 +561,7 @@ def _about(
 
 
 def _write_both(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]], about: dict[str, object]) -> None:
-    if path.suffix.lower() != ".csv":
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected a table .csv')
+    check_known(path, "format of a table", [path.suffix.lower()], [".csv"])
     # Both names are checked before either file is written.
     for file in (path, path.with_suffix(".json")):
         check_writable(file)

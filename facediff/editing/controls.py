@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationControls, DirectionLike
-from facediff.errors import OptionError
+from facediff.errors import OptionError, refuse_idle
 from facediff.utils.limits import FRAME_RATES
 
 # What edits an animation is imported where it is asked for: most animations have no controls.
@@ -34,8 +34,7 @@ def check_controls(controls: AnimationControls) -> None:
         ("controls_seed", not is_procedural(controls), "{blinks}, {gaze}, {sway} or {acting}"),
         ("eyes", controls.is_off, "{expressiveness}, {blinks}, {gaze} or {acting}"),
     ):
-        if getattr(controls, option) is not None and idle:
-            raise OptionError(option, f"has no effect without {users}; give one of them, or omit it")
+        refuse_idle(f"has no effect without {users}", **{option: idle and getattr(controls, option) is not None})
     if (keys := keys_of(controls.direction)) is not None:
         for name in ("expressiveness", "blinks", "gaze", "sway", *keys.instead_of):
             if getattr(controls, name) is not None:

@@ -32,7 +32,7 @@ from facediff.editing.lid_transfer import swing, with_lids, without_lids
 from facediff.editing.placing import place_face
 from facediff.editing.shapes import ShapeSet, built_in_files, fitted, is_built_in
 from facediff.editing.surface import Surface
-from facediff.errors import FaceDiffError, OptionError, damaged, located
+from facediff.errors import FaceDiffError, OptionError, damaged, located, refuse_idle
 from facediff.mesh import Mesh, Similarity, read_mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.parts import mesh_parts, named_triangles
@@ -85,11 +85,8 @@ def retarget(
         return to_y_up(carried, correspondence), correspondence
 
     if correspondence_path is not None and correspondence_path.exists():
-        if landmarks_path is not None or parts:
-            option = "{landmarks}" if landmarks_path is not None else "{part}"
-            raise OptionError.naming(
-                f"{option}: {correspondence_path} exists and would be used without it; remove that file, or omit it"
-            )
+        reason = f"{correspondence_path} exists and would be used without it"
+        refuse_idle(reason, landmarks=landmarks_path is not None, part=bool(parts))
         correspondence = load_correspondence(correspondence_path)
         refuse_other_mesh(
             str(mesh_path), mesh.vertices, mesh.faces, correspondence.target_vertices, correspondence.target_faces

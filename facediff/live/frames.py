@@ -18,8 +18,8 @@ from urllib.parse import parse_qsl, urlsplit
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError
-from facediff.registry import UnknownComponentError, receiver
+from facediff.errors import FaceDiffError, damaged, located
+from facediff.registry import receiver
 from facediff.spaces.rotations import convert
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hints import checks_arguments
@@ -182,47 +182,39 @@ def read_address(text: str) -> Address:
         >>> read_address("browser:8080").port, read_address("jsonl:-").path
         (8080, '-')
     """
+    expected = "expected scheme://HOST:PORT, scheme:FILE or a scheme alone, and options as ?name=value&name=value"
+    with damaged(f"{OPTION} {text}", expected):
+        return _parts(text)
 
-    def refuse(problem: str) -> FaceDiffError:
-        return FaceDiffError(
-            f"{OPTION} {text}: {problem}; expected scheme://HOST:PORT, scheme:FILE or a scheme alone, and options "
-            f"as ?name=value&name=value"
-        )
 
+def _parts(text: str) -> Address:
+    """The parts of an address; ValueError if it is none."""
     scheme, colon, rest = text.partition(":")
     if not colon:
         scheme, question, rest = text.partition("?")
         rest = question + rest
     if re.fullmatch(r"[a-z][a-z0-9_]*", scheme) is None:
-        raise refuse(f"{scheme!r} is no scheme")
+        raise ValueError(f"{scheme!r} is no scheme")
     rest, _, query = rest.partition("?")
-    try:
-        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query), max_num_fields=20)
-    except ValueError:
-        raise refuse(f"{query!r} are no options") from None
+    pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query), max_num_fields=20)
     host, port, path = None, None, rest
     if rest.startswith("//"):
-        try:
-            parts = urlsplit(f"{scheme}:{rest}")
-            host, port, path = parts.hostname, parts.port, parts.path.removeprefix("/")
-        except ValueError:
-            raise refuse("the host or the port is wrong") from None
+        parts = urlsplit(f"{scheme}:{rest}")
+        host, port, path = parts.hostname, parts.port, parts.path.removeprefix("/")
         if parts.username is not None or parts.fragment or not host:
-            raise refuse("the host is wrong")
+            raise ValueError("the host is wrong")
     elif rest.isdecimal():
         port, path = int(rest), ""
     if port is not None and not 0 < port <= 65_535:
-        raise refuse(f"port {port} does not exist")
+        raise ValueError(f"port {port} does not exist")
     return Address(text, scheme, host, port, path, dict(pairs))
 
 
 def open_receiver(text: str) -> Receiver:
     """The receiver at an address, which is not open yet."""
     address = read_address(text)
-    try:
+    with located(f"{OPTION} {text}"):
         implementation = receiver.get(address.scheme)
-    except UnknownComponentError as error:
-        raise FaceDiffError(f"{OPTION} {text}: {error}") from error
     options = receiver.options(address.scheme, list(address.options.items()), f"{OPTION} {text}")
     return cast(Receiver, implementation(address, **options))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import CheckedOptions
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, refuse_idle
 from facediff.registry import receiver
 from facediff.utils import ranges
 from facediff.utils.option import Option
@@ -53,8 +53,7 @@ class LiveOptions(CheckedOptions):
             raise FaceDiffError(
                 f"speech: {problem}; give a recording, - for samples on standard input, or --microphone"
             )
-        if self.speech != "-" and self.rate != 16_000:
-            raise OptionError("rate", "is for samples on standard input; omit it")
+        refuse_idle("is for samples on standard input", rate=self.speech != "-" and self.rate != 16_000)
         if not self.to:
             raise FaceDiffError(f"--to: missing; give a receiver, one of {', '.join(receiver.names())}")
         if self.sound is not None and self.sound.partition(":")[0] not in (OFF, OUT, RECEIVERS):

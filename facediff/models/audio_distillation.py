@@ -34,7 +34,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.augmentation import Augmenter, Example, SpeechAugmentation, read_augmentations
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, refuse_idle
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
 from facediff.models.transcribed import STEP_RATE, TranscribedRecording, read_transcribed
@@ -182,8 +182,8 @@ def distil_audio_encoder(
     weights = [weight for weight in student.parameters() if weight.requires_grad]
     if not weights:
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
-    if options.transcribed is not None and options.low_latency:
-        raise OptionError.naming("{transcribed}: is an option of {voices}; a low-latency student has none")
+    if options.low_latency:
+        refuse_idle("is an option of {voices}", transcribed=options.transcribed is not None)
     teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
     with model.choosing():

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from facediff.data import Assets, Batch, Reference, Sample, collate
-from facediff.errors import FaceDiffError, OptionError, check_known
+from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import LOW_LATENCY, FrameClock, MotionWindow, SpeechWindows, WindowPlan
@@ -324,11 +324,8 @@ class Inference(ABC):
         Args:
             expressivity: from 0 to 2; one number, or one for each vertex.
         """
-        if not isinstance(expressivity, Tensor) and expressivity == 1:
-            return
-        raise FaceDiffError(
-            f"expressivity: {type(self).__name__} predicts no mean around which samples lie; omit the option"
-        )
+        differs = isinstance(expressivity, Tensor) or expressivity != 1
+        refuse_idle(f"{type(self).__name__} predicts no mean around which samples lie", expressivity=differs)
 
     @contextmanager
     def expressed(self, expressivity: Expressivity | None) -> Iterator[None]:
@@ -344,7 +341,7 @@ class Inference(ABC):
 
     def choose_guidance(self, scales: Mapping[str, float]) -> None:
         """Follow some conditions more than the model would by itself, for all that follows."""
-        raise FaceDiffError(f"guidance: {type(self).__name__} cannot be guided; omit the option")
+        refuse_idle(f"{type(self).__name__} cannot be guided", guidance=True)
 
     def choices(self) -> dict[str, object]:
         """The choices for inference: windows, expressivity, and further ones of the model."""

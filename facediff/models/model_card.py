@@ -64,13 +64,12 @@ def read_scores(path: Path) -> list[dict[str, str]]:
     rows = list(read_rows(path, remedy=remedy))
     if not rows or not {"split", "method", "protocol", "frames"} <= rows[0].keys():
         raise FaceDiffError(f"{path}: is no table of test scores; {remedy}")
-    for number, row in enumerate(rows, start=2):
-        if not all(row[column].strip() for column in ("split", "method", "protocol", "frames")):
-            raise FaceDiffError(f"{path}: row {number} has too few cells; {remedy}")
-        for column in scored(rows):
-            row[column] = row[column].strip()
-            if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?|nan|", row[column], re.IGNORECASE):
-                raise FaceDiffError(f"{path}: its {column} is {quoted(row[column])}; expected a number. {remedy}")
+    number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?|nan|", re.IGNORECASE)
+    for row in rows:
+        row |= {column: row[column].strip() for column in scored(rows)}
+        about = all(row[column].strip() for column in ("split", "method", "protocol", "frames"))
+        if not about or not all(number.fullmatch(row[column]) for column in scored(rows)):
+            raise FaceDiffError(f"{path}: has the row {quoted(row)}, with an empty cell or no number; {remedy}")
     return rows
 
 

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from facediff.errors import ArgumentError
 from facediff.models.layers import (
     Attention,
     FeedForward,
@@ -26,6 +25,7 @@ from facediff.models.layers import (
     Share,
     Width,
     all_states,
+    check_heads,
     exporting,
     interpolate_frames,
 )
@@ -174,8 +174,7 @@ class TcnGruTransformer(StyleEncoder):
         statistics: bool = False,
     ) -> None:
         super().__init__()
-        if dim % 2:
-            raise ArgumentError({"dim": dim}, "dim must be even for the style encoder's bidirectional GRU")
+        check_heads(dim=dim, num_heads=num_heads, even=True)
         self.branches = nn.ModuleList(
             TemporalBlock(dim, d, kernel_size, causal=causal, dropout=dropout) for d in dilations
         )

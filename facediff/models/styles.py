@@ -24,7 +24,7 @@ from facediff.animation.style_files import (
     vector_in,
     with_layout,
 )
-from facediff.errors import OptionError, choices
+from facediff.errors import OptionError, choices, refuse_idle
 
 if TYPE_CHECKING:
     import numpy as np
@@ -113,10 +113,8 @@ def style_from(
 
 def refuse_without_styles(model: AnimationModel) -> None:
     """Refuse a style for a model that has none."""
-    if not style_width(model):
-        raise OptionError.naming(
-            "{style}: this checkpoint was trained without a dynamic style, so a style would change nothing; omit it"
-        )
+    reason = "this checkpoint was trained without a dynamic style, so a style would change nothing"
+    refuse_idle(reason, style=not style_width(model))
 
 
 def vector_of(style: Reference | Style, model: AnimationModel) -> Tensor:

@@ -22,7 +22,7 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.animation.options import AnimationOptions, DirectionLike, ExportOptions, Scales, scales_text
 from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
-from facediff.errors import OptionError
+from facediff.errors import OptionError, refuse_idle
 from facediff.pipelines.stages import (
     Act,
     AnimationStream,
@@ -77,16 +77,17 @@ def check_options(options: AnimationOptions) -> None:
         from facediff.editing.acting import read_acting
 
         read_acting(options.acting)
-    for name in ("frame_rate", "mesh"):
-        if getattr(options, name) is not None and not is_audio2face(options.checkpoint):
-            raise OptionError(
-                name, "is for a folder of Audio2Face-3D, other models have their own; omit it", getattr(options, name)
-            )
+    if not is_audio2face(options.checkpoint):
+        refuse_idle(
+            "is for a folder of Audio2Face-3D, other models have their own",
+            frame_rate=options.frame_rate is not None,
+            mesh=options.mesh is not None,
+        )
     for name in ("mesh", "target_mesh"):
         if (file := getattr(options, name)) is not None and not Path(file).is_file():
             raise OptionError(name, "no such file", file)
-    if options.style_template is not None and options.style is None:
-        raise OptionError("style_template", "belongs to a motion; give {style} as well")
+    if options.style is None:
+        refuse_idle("has no effect without {style}", style_template=options.style_template is not None)
     if options.own_shapes:
         from facediff.export.glb_own_shapes import own_shapes
 
@@ -145,12 +146,13 @@ class AnimationPipeline(ABC):
         self.options, self.facts, self.windows = options, face, windows
         self.frame_rate: float = face["frame_rate"]
         self.windows.in_frames(self.frame_rate)
-        one_animation = f"{model} makes one animation for all seeds; omit the option"
-        if options.samples > 1 and not samples:
-            raise OptionError("samples", one_animation, options.samples)
         draws_controls = is_procedural(options) and options.controls_seed is None
-        if options.seed and not samples and not draws_controls:
-            raise OptionError("seed", one_animation, options.seed)
+        if not samples:
+            refuse_idle(
+                f"{model} makes one animation for all seeds",
+                samples=options.samples > 1,
+                seed=bool(options.seed) and not draws_controls,
+            )
         self.seed = (
             options.seed if options.seed is not None else secrets.randbelow(2**31) if samples or draws_controls else 0
         )
@@ -404,10 +406,7 @@ def read_scales(guidance: Scales | None) -> dict[str, float]:
                 "expected each condition once with its scale, such as style=1.5,speech=1.2",
                 hints.shown(text),
             )
-        try:
-            scales[name.strip()] = hints.read(ranges.GuidanceScale, number.strip())
-        except ValueError as error:
-            raise OptionError("guidance", f"expected {error}", f"{name.strip()} {number.strip()}") from error
+        scales[name.strip()] = ranges.GUIDANCE_SCALE.read(f"{{guidance}}: {name.strip()}", number.strip())
     return scales
 
 

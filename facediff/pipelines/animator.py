@@ -23,7 +23,7 @@ from facediff.animation.options import (
     with_options,
 )
 from facediff.editing.controls import keys_of, refuse_folder
-from facediff.errors import FaceDiffError, OptionError, check_known
+from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options, direction_for
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
@@ -430,11 +430,12 @@ class Animator:
         settings = self._options(dtype, quiet=progress is not True, **options)
         recordings = recordings_of(speech)
         if recordings is not None:
-            for option in ("alignment", "transcript"):
-                if getattr(settings, option) is not None:
-                    raise OptionError(option, "is for one recording; omit it, or animate them one by one")
-            if name is not None:
-                raise FaceDiffError("name: is for one recording; omit it, each has its own")
+            refuse_idle(
+                "is for one recording",
+                alignment=settings.alignment is not None,
+                transcript=settings.transcript is not None,
+                name=name is not None,
+            )
         from facediff.speech.audio import speech_of
 
         animations: list[Animation | Samples] = []

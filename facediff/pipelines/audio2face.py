@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from facediff.animation.options import AnimationOptions
 from facediff.editing.regularised_weights import Regularisation, RegularisedSolver, TemporalTerm, pairs_of
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, refuse_idle
 from facediff.pipelines.animate import AnimationPipeline
 from facediff.pipelines.exported import FIXED
 from facediff.pipelines.stages import Stage, Take
@@ -24,6 +24,7 @@ from facediff.spaces.rotations import convert
 from facediff.speech.voice_activity import OFF
 from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.hints import Range
 from facediff.utils.licences import Licence, licence_metadata, require_cleared
 
 if TYPE_CHECKING:
@@ -138,9 +139,11 @@ class Audio2FacePipeline(AnimationPipeline):
         self.actor = folder.facts.actor or "actor"
         if options.commercial_only:
             require_cleared(options.checkpoint, licences_of(self.model))
-        for name in ("identity", "condition"):
-            if getattr(options, name) not in (None, self.actor):
-                raise OptionError(name, f"the folder has one face, {self.actor}; omit it", getattr(options, name))
+        refuse_idle(
+            f"the folder has one face, {self.actor}",
+            identity=options.identity not in (None, self.actor),
+            condition=options.condition not in (None, self.actor),
+        )
         text = _style_text(options)
         self.emotion = {} if text is None else emotions_of(text)
         self.model.emotion(self.emotion)  # refuses unknown emotions
@@ -322,10 +325,12 @@ class Audio2FaceStream:
 
 def refuse_fixed(options: AnimationOptions) -> None:
     """Refuse options that such a model does not have."""
-    changed = options.changed()
-    for name in (*FIXED, "expressivity", "window", "overlap", "low_latency"):
-        if name in changed and (name, changed[name]) not in (("device", "auto"), ("low_latency", False)):
-            raise OptionError(name, "has no meaning for Audio2Face-3D, whose frames have a window each; omit it")
+    changed = [
+        item[0] for item in options.changed().items() if item not in (("device", "auto"), ("low_latency", False))
+    ]
+    names = (*FIXED, "expressivity", "window", "overlap", "low_latency")
+    reason = "has no meaning for Audio2Face-3D, whose frames have a window each"
+    refuse_idle(reason, **{name: name in changed for name in names})
 
 
 def triangles_of(path: Path, vertices: int) -> npt.NDArray[np.int32]:
@@ -357,10 +362,7 @@ def emotions_of(text: str) -> dict[str, float]:
     strengths: dict[str, float] = {}
     for word in text.split(","):
         name, colon, number = word.partition(":")
-        try:
-            strengths[name.strip()] = float(number) if colon else 1.0
-        except ValueError as error:
-            raise OptionError("style", "expected emotions with strengths, such as joy:0.7,pain:0.2", text) from error
+        strengths[name.strip()] = Range(-10, 10).read(f"{{style}}: {name}", number.strip()) if colon else 1.0
     return strengths
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from facediff.animation.files import facts_of
 from facediff.animation.options import AnimationOptions
-from facediff.errors import OptionError
+from facediff.errors import OptionError, refuse_idle
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of
 from facediff.runtime.model import RuntimeModel, RuntimeStream
 from facediff.utils.files import valid_text
@@ -32,12 +32,10 @@ class ExportedPipeline(AnimationPipeline):
     """
 
     def __init__(self, options: AnimationOptions, *, model: RuntimeModel | None = None) -> None:
-        changed = options.changed()
-        for name in FIXED:
-            if name in changed and (name, changed[name]) != ("device", "auto"):
-                raise OptionError(
-                    name, "is fixed in an exported model; omit it, or animate with the checkpoint", changed[name]
-                )
+        fixed = {name: value for name, value in options.changed().items() if (name, value) != ("device", "auto")}
+        refuse_idle(
+            "is fixed in an exported model, unlike in its checkpoint", **{name: name in fixed for name in FIXED}
+        )
         self.model = copy(RuntimeModel.open(options.checkpoint, threads=options.threads) if model is None else model)
         about = self.model.description
         if options.commercial_only and about.licences.get("commercial_use") != "allowed":

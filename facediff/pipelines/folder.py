@@ -23,7 +23,7 @@ from facediff.pipelines.trained import open_pipeline
 from facediff.speech.audio import read_recording
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.batch import FileTask, Recipe, run_batch
-from facediff.utils.files import check_writable, locked, remove_partial
+from facediff.utils.files import check_folder_writable, check_writable, locked, remove_partial
 from facediff.utils.hub import is_exported, may_have_weights, model_files
 from facediff.utils.jobs import PerWorker, is_cluster
 from facediff.utils.output_paths import refuse_overwriting
@@ -279,8 +279,7 @@ def run_folder(
     gives further ones of one recording.
     ``make_worker``, a function of a module, is called once in each process with the command.
     """
-    if output.exists() and not output.is_dir():
-        raise OptionError("output", "is a file; expected a folder, since there are several recordings", output)
+    check_folder_writable(output)
     names = output_names(speeches, suffix)
     refuse_overwriting(speeches, [output / name for name in names])
     recipe = Recipe.of(command, files)

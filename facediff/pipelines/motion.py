@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Unpack, cast
 from facediff.animation import Animation
 from facediff.animation.files import AnimationFacts, complete, facts_of, read_animation
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.utils import ranges
 from facediff.utils.hub import bundled_by_name, is_graphs
 
@@ -154,8 +154,7 @@ class Page:
         from facediff.export.viewer import write_page
 
         path = Path(path)
-        if path.suffix not in (".html", ".htm"):
-            raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected .html')
+        check_known(path, "format of a page", [path.suffix], (".html", ".htm"))
         write_page(path, self.animations, max_mb=max_mb, truth=self.truth)
         return path
 
@@ -305,8 +304,8 @@ class SourceReader:
     """
 
     def __init__(self, options: SourceOptions) -> None:
-        if options.identity is not None and options.checkpoint is None:
-            raise OptionError("identity", "names a face of a checkpoint; give {checkpoint} as well")
+        if options.checkpoint is None:
+            refuse_idle("has no effect without {checkpoint}", identity=options.identity is not None)
         self.options = options
 
     @cached_property
@@ -356,11 +355,8 @@ class SourceReader:
         else:
             animation = read_animation(path, overrides, defaults)
         for option, value in (("frame_rate", animation.frame_rate), ("unit", animation.unit)):
-            option_value = getattr(self.options, option)
-            if not bare and option_value not in (None, value):
-                raise OptionError(
-                    option, f"{path.name} has {value} by itself; the option is for a bare .npy", option_value
-                )
+            contradicts = not bare and getattr(self.options, option) not in (None, value)
+            refuse_idle(f"is for a bare .npy, and {path.name} has {value} by itself", **{option: contradicts})
         animation.refuse_not_finite()
         return animation
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationOptions, ExportOptions, RecordingOptions
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import FaceDiffError, OptionError, refuse_idle
 from facediff.pipelines.animate import check_options, direction_for
 from facediff.pipelines.trained import open_pipeline
 from facediff.speech.pcm import pcm
@@ -81,9 +81,8 @@ def check_stream(options: AnimationOptions, output: Path, export: ExportOptions)
             output,
         )
     options_changed = {**options.changed(), **export.changed()}
-    for name in WHOLE:
-        if name in options_changed:
-            raise OptionError(name, "needs the whole animation; stream to .npy, then use `facediff export`")
+    needs_animation = "needs the whole animation, as `facediff export` takes it from a streamed .npy"
+    refuse_idle(needs_animation, **{name: name in options_changed for name in WHOLE})
     if sys.stdin is None:
         raise OptionError.naming("{stream}: standard input is closed; send samples to it")
     if str(output) != "-":

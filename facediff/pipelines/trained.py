@@ -16,7 +16,7 @@ import numpy as np
 
 from facediff.animation.animation import WITHOUT_FACE
 from facediff.animation.options import AnimationOptions
-from facediff.errors import OptionError
+from facediff.errors import OptionError, refuse_idle
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of, read_scales
 from facediff.registry import name_of
 from facediff.spaces.rigs import LinearRig
@@ -63,8 +63,7 @@ class TrainedPipeline(AnimationPipeline):
     """
 
     def __init__(self, options: AnimationOptions, *, model: AnimationModel | None = None) -> None:
-        if options.threads:
-            raise OptionError("threads", "is for an exported model; omit it", options.threads)
+        refuse_idle("is for an exported model", threads=bool(options.threads))
         if model is None:
             from facediff.models import load_model
 
@@ -211,11 +210,9 @@ class TrainedPipeline(AnimationPipeline):
         from facediff.editing.expressiveness import ALL, region_factors
 
         factors, name = expressivity_of(self.options), type(self.model).__name__
-        if not self.model.samples and {*factors.values()} != {1.0}:
-            raise OptionError(
-                "expressivity",
-                f"{name} makes one animation and no samples around a mean; omit the option",
-                self.options.expressivity,
+        if not self.model.samples:
+            refuse_idle(
+                f"{name} makes one animation and no samples around a mean", expressivity={*factors.values()} != {1.0}
             )
         if {*factors} == {ALL}:
             self.model.choose_expressivity(factors[ALL])

@@ -226,10 +226,8 @@ def inside(folder: Path, about: Path, key: str, name: str, suffix: str | None = 
     with damaged(about, REMEDY):
         path = folder / name.replace("\\", "/")
         path = path if suffix is None else path.with_suffix(suffix)
-        if ":" in name or not path.resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"{key} is {name!r}, which lies outside the folder")
-        if not path.is_file():
-            raise ValueError(f"{key} is {path.name}, and there is no such file")
+        if ":" in name or not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
+            raise ValueError(f"{key} is {path.name}, which is no file inside the folder")
     return path
 
 
@@ -258,10 +256,8 @@ def read_facts(path: Path) -> NetworkFacts:
             buffer=int(audio["buffer_len"]),
             before=int(audio["buffer_ofs"]),
         )
-        if len(set(facts.emotions)) < len(emotions):
-            raise ValueError("explicit_emotions has a name twice")
-        if not 0 <= facts.before <= facts.buffer <= LONGEST_BUFFER:
-            raise ValueError(f"buffer_len is {facts.buffer} with buffer_ofs {facts.before}")
+        if len(set(facts.emotions)) < len(emotions) or not 0 <= facts.before <= facts.buffer <= LONGEST_BUFFER:
+            raise ValueError(f"buffer_len is {facts.buffer} with buffer_ofs {facts.before}, or an emotion occurs twice")
     return facts
 
 
@@ -277,8 +273,6 @@ def read_settings(path: Path, database: Path) -> tuple[AnimatorSettings, Array]:
         if settings.face_mask_softness <= 0:
             raise ValueError(f"face_mask_softness is {settings.face_mask_softness:g}; expected more than 0")
         shots = _names(arrays, "emo_spec_names")
-        if config["source_shot"] not in shots:
-            raise ValueError(f"source_shot {config['source_shot']} is none of {database.name}")
         shot, frame = shots.index(config["source_shot"]), int(config["source_frame"])
         if not 0 <= frame < arrays["emo_spec_size"][shot]:
             raise ValueError(f"source_frame {frame} lies outside its shot")
@@ -359,15 +353,10 @@ def _pairs(params: Mapping[str, Any], name: str, count: int) -> tuple[int, ...]:
 
 def _matrix(arrays: Mapping[str, npt.NDArray[Any]], name: str, shape: tuple[int, ...]) -> Array:
     """An array in this shape, however its axes are folded in the file."""
-    if arrays[name].dtype.kind != "f":
-        raise ValueError(f"{name} is {arrays[name].dtype}; expected floating point")
-    try:
-        array: Array = np.ascontiguousarray(arrays[name], np.float32).reshape(shape)
-    except ValueError:
-        raise ValueError(f"{name} has the shape {arrays[name].shape}; expected {shape}") from None
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} is not finite")
-    return array
+    array: Array = np.ascontiguousarray(arrays[name], np.float32)
+    if arrays[name].dtype.kind != "f" or not np.isfinite(array).all():
+        raise ValueError(f"{name} is {arrays[name].dtype} of shape {array.shape}; expected finite floating point")
+    return array.reshape(shape)
 
 
 def _names(arrays: Mapping[str, npt.NDArray[Any]], name: str) -> list[str]:

@@ -206,11 +206,10 @@ def _check(description: Description) -> None:
         "voice_gate": (USUAL_GATE, OFF),
         "decoded": ("sample", "kept"),
     }
-    for name, values in allowed.items():
-        if getattr(description, name) not in values:
-            raise ValueError(
-                f"{name} is {quoted(getattr(description, name))}; expected {' or '.join(map(str, values))}"
-            )
+    stated = {name: getattr(description, name) for name in allowed} | {"clock": description.frame_clock.rule}
+    for name, values in (allowed | {"clock": get_args(Rule)}).items():
+        if stated[name] not in values:
+            raise ValueError(f"{name} is {quoted(stated[name])}; expected {' or '.join(map(str, values))}")
     needed, optional = NEEDED[description.generation], OPTIONAL[description.generation]
     if not {*needed} <= {*description.graphs} <= {*needed, *optional}:
         raise ValueError(f"graphs are {', '.join(description.graphs)}; expected {', '.join(needed)}")
@@ -222,8 +221,6 @@ def _check(description: Description) -> None:
         empty = steps == "steps" and description.generation == "sampled" and not rows
         if len(rows) != len(getattr(description, steps)) or not fits or empty:
             raise ValueError(f"{table} has not five or six numbers below 10^9 for each step, of one step at least")
-    if description.frame_clock.rule not in get_args(Rule):
-        raise ValueError(f"clock has the rule {quoted(description.frame_clock.rule)}")
     _ = description.motion_space
     description.plan.in_frames(description.frame_rate)
 

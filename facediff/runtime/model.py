@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import WITHOUT_FACE
-from facediff.errors import FaceDiffError, OptionError, check_known
+from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.runtime.folder import Arrays, Description, decoder_of
 from facediff.runtime.graphs import ExportedGraphs
 from facediff.runtime.sampling import NAME, RuntimeChoices, RuntimeConditions, WindowSpeech, clip_motion, window_motion
@@ -184,16 +184,15 @@ class RuntimeModel(ExportedGraphs):
                 raise OptionError("style", f"{vector.name} is of another model; encode it with this one")
         elif style is not None:
             # The model's identities are its styles, if it has any: the one that it is conditioned on is the style.
-            if about.style_source == "none":
-                raise OptionError("style", f"{about.model} knows no speaking styles; omit the option")
+            refuse_idle(f"{about.model} knows no speaking styles", style=about.style_source == "none")
             check_known("{style}", "style", [str(style)], about.styles)
             conditioned_on = str(style)
             vector = RuntimeStyle(conditioned_on, vector.vector)
         for option, value, kind in (("seed", choice.seed, Seed), ("expressivity", choice.expressivity, Expressivity)):
             if (expected := mismatch(kind, value)) is not None:
                 raise OptionError(option, f"out of range; expected {expected}", value)
-        if choice.expressivity != 1 and about.last_step < 0:
-            raise OptionError("expressivity", f"{about.model} predicts no mean of its motion; omit the option")
+        if about.last_step < 0:
+            refuse_idle(f"{about.model} predicts no mean of its motion", expressivity=choice.expressivity != 1)
         face = about.faces.index(identity)
         index = about.identities.index(conditioned_on) if conditioned_on in about.identities else -1
         vertices = about.motion_space.is_vertices

@@ -22,7 +22,7 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, OptionError, needs_extra
+from facediff.errors import FaceDiffError, OptionError, needs_extra, refuse_idle
 from facediff.speech.pcm import samples_of
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
@@ -347,8 +347,8 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         else:
             recording = speech_of(speech["path"], None, max_seconds)
         return replace(recording, name=name)
-    if rate is not None and (isinstance(speech, str | Path | tuple) or hasattr(speech, "read")):
-        raise FaceDiffError("rate: a recording and a pair have their own; omit it")
+    if isinstance(speech, str | Path | tuple) or hasattr(speech, "read"):
+        refuse_idle("a recording and a pair have their own", rate=rate is not None)
     if isinstance(speech, str | Path):
         return read_recording(Path(speech), max_seconds)
     if hasattr(speech, "read"):

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, check_known
 from facediff.speech.audio import write_wav
 from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.synthetic.articulation import speech_sounds
@@ -231,8 +231,7 @@ def generate(
     _refuse_foreign(root, variant.corpus)
     every = variant.clips(drawn, people)
     clips = [clip for clip in every if only is None or clip.name in only]
-    if unknown := {*(only or ())} - {clip.name for clip in clips}:
-        raise FaceDiffError(f"the built-in corpus has no clip {min(unknown)!r}; clips are named like {every[0].name!r}")
+    check_known("the built-in corpus", "clip", only or (), [clip.name for clip in clips])
     with atomic_folder(root, replace=True) as folder:
         _write_common(folder, clips, people, variant)
         work = partial(_write_clip, folder, seed=seed, people=tuple(people), variant=variant)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import check_known
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.rigs import LinearRig
 from facediff.synthetic.cast import CAST
@@ -90,8 +90,7 @@ def built_in_shapes(speaker: str | None = None) -> tuple[Array, Index, dict[str,
     Args:
         speaker: a speaker of the corpus; the average head if None.
     """
-    if speaker is not None and speaker not in CAST:
-        raise FaceDiffError(f'--identity: there is no speaker "{speaker}"; {choices(speaker, CAST)}')
+    check_known("--identity", "speaker", [] if speaker is None else [speaker], CAST)
     mesh = build_head()
     if speaker is None:
         rest, fields = mesh.vertices / 1000.0, [head_shapes()[name] / 1000.0 for name in SHAPES]

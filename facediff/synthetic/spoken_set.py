@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.spaces.rigs import LinearRig
 from facediff.speech.audio import write_wav
 from facediff.speech.espeak import SpokenPhoneme, Utterance
@@ -124,8 +124,7 @@ def spoken_set(languages: Sequence[str], voices: int, sentences: int) -> list[Sp
     installed = installed_voices()
     clips = []
     for code in languages:
-        if code not in LANGUAGES:
-            raise FaceDiffError(f"--languages {code}: {choices(code, LANGUAGES)}")
+        check_known("--languages", "language", [code], LANGUAGES)
         language = LANGUAGES[code]
         usable = [voice for voice in language.voices if voice.partition(":")[0] in installed]
         if not usable:

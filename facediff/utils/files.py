@@ -105,6 +105,13 @@ def _remove(path: Path) -> None:
             path.unlink()
 
 
+def refuse_content(path: Path, *, replace: bool = False) -> None:
+    """Refuse a file, and a folder with content unless it may be replaced, where a folder shall appear."""
+    if path.exists() and (not path.is_dir() or (not replace and any(path.iterdir()))):
+        fault = "is not empty" if path.is_dir() else "is a file"
+        raise FaceDiffError(f"{path}: {fault}; choose a new folder, or remove this one")
+
+
 @contextmanager
 def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Write a folder whole or not at all.
@@ -117,9 +124,7 @@ def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
         a hidden folder next to ``path``, to be filled. It is renamed to ``path`` at the end and removed if anything
         fails; leftovers of a killed process are removed by the next one that writes the folder.
     """
-    if path.exists() and (not path.is_dir() or (not replace and any(path.iterdir()))):
-        fault = "is not empty" if path.is_dir() else "is a file"
-        raise FaceDiffError(f"{path}: {fault}; choose a new folder, or remove this one")
+    refuse_content(path, replace=replace)
     with scratch_folder(path) as scratch:
         content = scratch / path.name
         content.mkdir()

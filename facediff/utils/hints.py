@@ -98,11 +98,11 @@ class Range:
         return f"{noun} {self}".strip()
 
     def read(self, name: str, text: str, *, whole: bool = False) -> float:
-        """The number of an option or a field that a text spells; an error names it."""
+        """The number of an option (in braces) or a field that a text spells; an error names it."""
         try:
             number: float = read(Annotated[int if whole else float, self], text)
         except ValueError as error:
-            raise FaceDiffError(f"{name} {shown(text)}: expected {error}") from error
+            raise OptionError.naming(f"{name} {shown(text)}: expected {error}") from error
         return number
 
 

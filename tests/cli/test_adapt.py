@@ -169,7 +169,7 @@ def test_what_cannot_work_is_said_before_training(
         ("--person nobody", "neither a person's folder"),
         ("--face LiveLink --data-root .", "no recordings of live_link; expected .csv"),
         ("--voices 2 --mode joint", "--mode: has no effect without --person"),
-        ("--train head --person C", "--train head: is for --face"),
+        ("--train head --person C", "--train: head is for --face"),
         ("", "expected one of them"),
     ):
         assert main(["adapt", "--checkpoint", str(checkpoint), "-o", "out.ckpt", *words.split()]) == 2

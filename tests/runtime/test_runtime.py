@@ -482,4 +482,4 @@ def test_command_animates_a_folder(folder: Path, tmp_path: Path, capsys: pytest.
     np.testing.assert_array_equal(found.vertices, expected.vertices)
     assert found.metadata["seed"] == "3"
     assert facediff_main([*words, "--steps", "3"]) == 2
-    assert "--steps 3: is fixed in an exported model" in capsys.readouterr().err
+    assert "--steps: is fixed in an exported model" in capsys.readouterr().err

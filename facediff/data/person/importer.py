@@ -37,7 +37,7 @@ from facediff.mesh.alignment import chunks
 from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
 from facediff.utils import ranges
 from facediff.utils.checksums import describe_files
-from facediff.utils.files import check_writable, put_in_place, scratch_folder
+from facediff.utils.files import check_writable, put_in_place, refuse_content, scratch_folder
 from facediff.utils.plain_files import write_json, write_rows
 
 MIN_SECONDS = 2.0
@@ -162,8 +162,7 @@ def check_entry(name: str, output: Path) -> Path:
     path = output.expanduser().absolute()
     if not NAME.fullmatch(name):
         raise FaceDiffError(f"--name {name!r}: expected letters, digits and dashes, at most 64, with no dash first")
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise FaceDiffError(f"{path}: is a file or not empty; choose a new folder, or remove this one")
+    refuse_content(path)
     check_writable(path / "manifest.json")
     check_writable(path.with_name(f".{path.name}.probe"))
     return path

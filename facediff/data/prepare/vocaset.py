@@ -29,7 +29,7 @@ from facediff.data.preparation import (
     write_templates,
 )
 from facediff.data.reconstructions import resample_frames
-from facediff.errors import FaceDiffError, damaged
+from facediff.errors import FaceDiffError, damaged, refuse_idle
 from facediff.utils.arrays import open_vertices
 from facediff.utils.pickles import load_pickle
 
@@ -76,8 +76,7 @@ def plan(
         dtype: of the motion on disk
         regions: folder with lists of vertices; regions/ of the raw folder if not given
     """
-    if frame_rate == 60 and decimate != "every_second":
-        raise FaceDiffError(f"--decimate {decimate}: nothing is decimated at 60 frames a second; omit it")
+    refuse_idle("nothing is decimated at 60 frames a second", decimate=frame_rate == 60 and decimate != "every_second")
     vertices, templates_file = _need(raw, VERTICES), _need(raw, TEMPLATES)
     row_map, sounds = _nested(_need(raw, ROWS)), _nested(_need(raw, AUDIO))
     n_vertices = open_vertices(vertices).shape[1]

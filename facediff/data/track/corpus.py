@@ -38,7 +38,7 @@ from facediff.data.track.options import TrackingOptions
 from facediff.data.track.recording import Recording, RecordingSummary, summarise, video_tracker
 from facediff.data.track.topology import BROWS, EYELID_PAIRS, LIP_PAIRS, LIPS, UPPER_FACE, without_webs
 from facediff.data.track.video import SUFFIXES
-from facediff.errors import FaceDiffError, counted
+from facediff.errors import FaceDiffError, counted, refuse_idle
 from facediff.speech.audio import SAMPLE_RATE, fit_length, samples_for
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
@@ -111,8 +111,7 @@ def find_videos(source: Path, name: str | None) -> dict[str, list[Path]]:
         if direct and folders:
             raise FaceDiffError(f"{source}: holds videos and folders; expected one person's videos, or a folder each")
         videos = {name or source.resolve().name: direct} if direct else {path.name: videos_in(path) for path in folders}
-        if name and not direct:
-            raise FaceDiffError(f"--name {name}: {source} has a folder for each person, whose names are theirs")
+        refuse_idle(f"{source} has a folder for each person, whose names are theirs", name=bool(name and not direct))
         videos = {person: files for person, files in videos.items() if files}
     for person in videos:
         if not NAME.fullmatch(person):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, check_known
+from facediff.errors import check_known
 from facediff.reporting.drawing import FONT, GREY, SMALLEST_TEXT, TEXT, drawing_settings, matplotlib, plain
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
@@ -56,8 +56,7 @@ class Paper:
 
 def check_output(path: Path) -> None:
     """Check, before any work is done, that a figure can be written to a file."""
-    if path.suffix.lower() not in DATES:
-        raise FaceDiffError(f'--output {path}: unknown suffix "{path.suffix}"; expected one of {", ".join(DATES)}')
+    check_known(path, "format", [path.suffix.lower()], DATES)
     check_writable(path)
 
 

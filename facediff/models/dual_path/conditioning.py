@@ -23,7 +23,7 @@ from facediff.models.layers import exporting, frame_mask
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.speaker_encoders import IdentityEncoder, StyleEncoder
 from facediff.utils import ranges
-from facediff.utils.hints import mismatch
+from facediff.utils.hints import check_number
 
 TokenForm = Literal["levels", "single"]
 
@@ -286,8 +286,7 @@ class ConditionedModel(AnimationModel):
         """Follow conditions more (above 1) or less from now on; checkpoints keep the original scales."""
         check_known("guidance", "condition", scales, CONDITIONS)
         for name, scale in scales.items():
-            if (expected := mismatch(ranges.GuidanceScale, scale)) is not None:
-                raise FaceDiffError(f"guidance: {name}={scale} is out of range; expected {expected}")
+            check_number("guidance", name, scale, ranges.GUIDANCE_SCALE.least, ranges.GUIDANCE_SCALE.most)
             if scale != 1 and name not in self.guidable:
                 raise FaceDiffError(
                     f"guidance: {name}={scale:g} needs a model that knows motion without it; train one with "

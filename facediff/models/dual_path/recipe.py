@@ -27,7 +27,7 @@ from facediff.models.motion_space import ComponentMotion, MotionSpace, Projectio
 from facediff.models.samplers import NoiseProcess, Sampler
 from facediff.speech.windows import LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS
 from facediff.utils import ranges
-from facediff.utils.hints import defaults, mismatch
+from facediff.utils.hints import check_number, defaults, mismatch
 from facediff.utils.ranges import Range
 
 NumericScale = Annotated[float, Range(1e-6, 1e6)]
@@ -306,9 +306,8 @@ class DualPathRecipe(ConditionedModel):
                 f"expressivity: has the shape {tuple(expressivity.shape)}; expected one number, or one for each of "
                 f"{self.n_vertices} vertices"
             )
-        wrong = [(number, word) for number in numbers if (word := mismatch(ranges.Expressivity, number)) is not None]
-        if wrong:
-            raise FaceDiffError(f"expressivity {wrong[0][0]}: out of range; expected {wrong[0][1]}")
+        for number in numbers:
+            check_number("expressivity", "a number", number, ranges.EXPRESSIVITY.least, ranges.EXPRESSIVITY.most)
         self.expressivity = expressivity
 
     def default_style(self, identity: str) -> Reference | Style:

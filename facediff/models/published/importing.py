@@ -22,7 +22,7 @@ from torch import Tensor
 from facediff import registry
 from facediff.data import Assets
 from facediff.data.corpus import as_template, read_templates
-from facediff.errors import FaceDiffError, OptionError, choices, damaged
+from facediff.errors import FaceDiffError, OptionError, choices, damaged, refuse_idle
 from facediff.hyperparameters import component_class
 from facediff.metrics import Region
 from facediff.models.checkpoint_content import IMPORTED
@@ -113,11 +113,9 @@ def convert(paths: str | Path | Sequence[str | Path], options: ImportOptions) ->
     """Read files, and make the model that they ask for; its weights are not loaded yet."""
     files = read_files([Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths])
     card = files.card
-    for name in ("dataset", "identities", "templates", "regions", "mesh", "statistics", "data_root", "template_row"):
-        if getattr(options, name) is not None and name not in card.reads:
-            raise OptionError.naming(
-                f"{{{name}}}: {card.method} does not read this option, which would have no effect; omit it"
-            )
+    names = ("dataset", "identities", "templates", "regions", "mesh", "statistics", "data_root", "template_row")
+    unread = {name: getattr(options, name) is not None for name in names if name not in card.reads}
+    refuse_idle(f"{card.method} does not read this option, which would have no effect", **unread)
     options, unused = options.with_hparams()
     method: type[PublishedModel] = registry.model.get(card.method)
     given_options = options.all_model_options()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from facediff.errors import FaceDiffError
+from facediff.errors import check_known, refuse_idle
 from facediff.spaces.files.arrays import read_array, write_array
 from facediff.spaces.files.beat import read_beat, write_beat
 from facediff.spaces.files.clips import ParameterClip
@@ -38,8 +38,7 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
     suffix = _suffix(path, SUFFIXES)
     if suffix in ARRAYS:
         return read_array(path, layout, frame_rate)
-    if layout is not None:
-        raise FaceDiffError(f"{path}: names its columns itself; omit the layout {layout}")
+    refuse_idle(f"{path} names its columns itself", layout=layout is not None)
     if suffix == ".json":
         return read_beat(path)
     header = next(read_table(path, remedy=REMEDY), [])
@@ -67,6 +66,5 @@ def write_parameters(path: str | Path, clip: ParameterClip, *, layout: str = "")
 
 def _suffix(path: Path, suffixes: tuple[str, ...]) -> str:
     """A path's suffix in lower case; refused if it is none of these."""
-    if path.suffix.lower() not in suffixes:
-        raise FaceDiffError(f'{path}: unknown suffix "{path.suffix}"; expected {", ".join(suffixes)}')
+    check_known(path, "format", [path.suffix.lower()], suffixes)
     return path.suffix.lower()
