@@ -256,8 +256,10 @@ def read_facts(path: Path) -> NetworkFacts:
             buffer=int(audio["buffer_len"]),
             before=int(audio["buffer_ofs"]),
         )
-        if len(set(facts.emotions)) < len(emotions) or not 0 <= facts.before <= facts.buffer <= LONGEST_BUFFER:
-            raise ValueError(f"buffer_len is {facts.buffer} with buffer_ofs {facts.before}, or an emotion occurs twice")
+        if len(set(facts.emotions)) < len(emotions):
+            raise ValueError("explicit_emotions has a name twice")
+        if not 0 <= facts.before <= facts.buffer <= LONGEST_BUFFER:
+            raise ValueError(f"buffer_len is {facts.buffer} with buffer_ofs {facts.before}")
     return facts
 
 
@@ -356,7 +358,8 @@ def _matrix(arrays: Mapping[str, npt.NDArray[Any]], name: str, shape: tuple[int,
     array: Array = np.ascontiguousarray(arrays[name], np.float32)
     if arrays[name].dtype.kind != "f" or not np.isfinite(array).all():
         raise ValueError(f"{name} is {arrays[name].dtype} of shape {array.shape}; expected finite floating point")
-    return array.reshape(shape)
+    with damaged(name, REMEDY):
+        return array.reshape(shape)
 
 
 def _names(arrays: Mapping[str, npt.NDArray[Any]], name: str) -> list[str]:
