@@ -97,7 +97,7 @@ def refused(*words: str) -> str:
     with pytest.raises(FaceDiffError) as caught:
         arguments_of(command, "facediff command", words)
     assert len(str(caught.value).splitlines()) == 1
-    return str(caught.value)
+    return caught.value.on_command_line
 
 
 def test_defaults() -> None:
