@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, TypedDict, TypeVar
+from typing import IO, Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +20,6 @@ from facediff.utils.files import atomic
 from facediff.utils.hints import check_number
 from facediff.utils.limits import FRAME_RATES, SAMPLE_RATES, check_format, quoted
 from facediff.utils.plain_files import json_text, parse_json
-
-T = TypeVar("T")
 
 FORMAT = "facediff take 1"
 """Marks an archive. The word is older than the class :class:`Animation`; it stays, so that old and new files agree."""

@@ -33,9 +33,7 @@ class ExportedPipeline(AnimationPipeline):
 
     def __init__(self, options: AnimationOptions, *, model: RuntimeModel | None = None) -> None:
         fixed = {name: value for name, value in options.changed().items() if (name, value) != ("device", "auto")}
-        refuse_idle(
-            "is fixed in an exported model, unlike in its checkpoint", **{name: name in fixed for name in FIXED}
-        )
+        refuse_idle("is fixed in an exported model", **{name: name in fixed for name in FIXED})
         self.model = copy(RuntimeModel.open(options.checkpoint, threads=options.threads) if model is None else model)
         about = self.model.description
         if options.commercial_only and about.licences.get("commercial_use") != "allowed":

@@ -11,9 +11,9 @@ import re
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
-from facediff.errors import FaceDiffError, check_known, damaged
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.hints import is_name
-from facediff.utils.limits import brief
+from facediff.utils.limits import brief, quoted
 
 Kind = Literal["vertices", "arkit", "flame", "linear"]
 Joint = Literal["head", "neck", "jaw", "left_eye", "right_eye"]
@@ -139,7 +139,8 @@ class Space:
     def index(self, name: str) -> int:
         """The channel of a name, without regard to case."""
         folded = [channel.casefold() for channel in self.channels]
-        check_known("space", "channel", [name.casefold()], folded)
+        if name.casefold() not in folded:
+            raise FaceDiffError(f'space: has no channel "{name}"; its channels are {quoted(list(self.channels))}')
         return folded.index(name.casefold())
 
     def region(self, name: str) -> tuple[int, ...]:
