@@ -163,7 +163,7 @@ def test_shapes_of_another_topology_are_carried(
         (["bare.npy", "-o", "w.csv", "--shapes", "shapes", "--frame-rate", "25", "--show", "a.png"], "without a mesh"),
         (["take.npz", "--write-puppet-shapes", "new"], "has no effect with animation; omit it"),
         (["--write-puppet-shapes", "shapes"], "shapes: is not empty"),
-        (["--write-puppet-shapes", "new", "--identity", "F9"], 'no speaker "F9"; known are'),
+        (["--write-puppet-shapes", "new", "--identity", "F9"], 'no speaker "F9": known are'),
     ],
 )
 def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
