@@ -454,7 +454,7 @@ def test_facediff_load_animates_a_folder_as_a_model(folder: Path, tmp_path: Path
     for option, value in {"steps": 3, "guidance": {"style": 2}, "precision": "bf16"}.items():
         with pytest.raises(FaceDiffError, match=f"{option}: is fixed in an exported model"):
             model.animate(speech, 16_000, **{option: value})  # type: ignore[call-overload]
-    with pytest.raises(FaceDiffError, match="device cuda.*fixed in an exported model"):
+    with pytest.raises(FaceDiffError, match="device: is fixed in an exported model"):
         facediff.load(folder, device="cuda")
     with pytest.raises(FaceDiffError, match="expressivity"):
         model.animate(speech, 16_000, expressivity={"lips": 0.5})
