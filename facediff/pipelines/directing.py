@@ -156,7 +156,7 @@ def plan_runs(
                 f"to be generated; use fewer different values"
             )
         with model.choosing():
-            settings = {name: value for name, value, _ in combination}
+            settings: dict[str, Any] = {name: value for name, value, _ in combination}
             for name, value in settings.items():
                 with located(f"{direction.source}: channel {name}"):
                     if name.startswith("guidance."):
