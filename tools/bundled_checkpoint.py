@@ -28,7 +28,7 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
-from facediff.cli.adapt import OF_TRAINING
+from facediff.cli.adapt import TRAINING_STATE
 from facediff.cli.generation_metrics import corpus_of_checkpoint
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     off = compare(model, given.folder, trial_speech())["share_of_range"]
     if not off < SAME:
         raise FaceDiffError(f"{given.template}: gives other motion than {given.folder}; train it by the same recipe")
-    content = {key: value for key, value in content.items() if key not in OF_TRAINING}
+    content = {key: value for key, value in content.items() if key not in TRAINING_STATE}
     AtomicCheckpointIO().save_checkpoint({**content, "state_dict": weights}, given.output)
     print(f"wrote {given.output}: its motion differs from the folder's by {off:.1e} of the range")
 

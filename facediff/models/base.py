@@ -53,6 +53,8 @@ DIVERGENCE_INTERVAL = 50
 
 def read_space(space: object, points: int) -> Space:
     """A space, or its state, or None for vertices."""
+    if not isinstance(space, Space | dict | None):
+        raise ArgumentError({"space": space}, "expected a Space, or its state as a dict")
     with damaged("space", "give the corpus's own"):
         record = Space() if space is None else space if isinstance(space, Space) else Space.from_state(space)
     if not record.is_vertices and len(record.channels) != points:

@@ -279,6 +279,8 @@ def run_folder(
     gives further ones of one recording.
     ``make_worker``, a function of a module, is called once in each process with the command.
     """
+    if workers is not None and workers < 1:  # 0 would mean the usual number, without a word
+        raise OptionError("workers", "expected 1 or more", workers)
     check_folder_writable(output)
     names = output_names(speeches, suffix)
     refuse_overwriting(speeches, [output / name for name in names])

@@ -357,6 +357,8 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
         with open_sound(file, path) as sound:
             return SpeechRecording.of(*_decoded(sound, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
+        if len(speech) != 2:
+            raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
         first, second = cast("tuple[Any, Any]", speech)
         rate_first = isinstance(first, numbers.Real)  # NumPy's as well
         speech, rate = (second, first) if rate_first else (first, second)

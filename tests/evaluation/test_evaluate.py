@@ -108,7 +108,7 @@ def test_regions_come_from_masks_and_weights(tmp_path: Path) -> None:
     assert (lips.indices, upper.indices) == ((1, 3), (5, 7))
     weighted = read_region("lips", 4, folder=tmp_path, source="mouth.txt>0.1")
     assert (weighted.indices, weighted.name) == ((1, 3), "mouth.txt>0.1")
-    with pytest.raises(FaceDiffError, match="the motion has 5"):
+    with pytest.raises(FaceDiffError, match="4 vertices, not of 5"):
         read_region("lips", 5, folder=tmp_path, source="mouth.txt>0.1")
     assert read_region("upper_face", 3, source="all").count == 3
 

@@ -106,7 +106,7 @@ def test_what_cannot_be_learnt_is_refused(model: AnimationModel, tiny: Tiny) -> 
     for name in ("speed", "pauses"):
         with pytest.raises(FaceDiffError, match=name):
             distil_audio_encoder(model, tiny, replace(FEW, augmentations=["noise", name]))
-    with pytest.raises(FaceDiffError, match=r"data\.augmentations"):
+    with pytest.raises(FaceDiffError, match='no augmentation "voices"'):
         distil_audio_encoder(model, tiny, replace(FEW, augmentations=["voices"]))
     model.speech_encoder.requires_grad_(False)
     with pytest.raises(FaceDiffError, match="audio_encoder"):

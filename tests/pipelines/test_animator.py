@@ -150,7 +150,7 @@ TONE = (0.3 * np.sin(np.arange(16000) / 7)).astype(np.float32)
         (["tone.wav"], {"sampler": "dim"}, "sampler"),
         (["tone.wav"], {"expressivity": 3}, "expressivity 3.0"),
         (["tone.wav"], {"expressivity": {"chin": 1}}, "chin"),
-        (["tone.wav"], {"guidance": {"style": 99}}, "guidance style"),
+        (["tone.wav"], {"guidance": {"style": 99}}, "guidance: style"),
         (["tone.wav"], {"precision": "16"}, "precision 16"),
         (["tone.wav"], {"window": 0.01}, "window"),
         (["tone.wav"], {"blinks": 0}, "blinks 0"),

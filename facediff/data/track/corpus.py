@@ -40,6 +40,7 @@ from facediff.data.track.topology import BROWS, EYELID_PAIRS, LIP_PAIRS, LIPS, U
 from facediff.data.track.video import SUFFIXES
 from facediff.errors import FaceDiffError, counted, refuse_idle
 from facediff.speech.audio import SAMPLE_RATE, fit_length, samples_for
+from facediff.utils.arrays import open_array
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
 from facediff.utils.cross_correlation import correlations, peak
@@ -360,7 +361,7 @@ class PeopleWriter:
         faces = []
         for frame in frames:
             number = int(np.searchsorted(starts, frame, side="right")) - 1
-            motion = np.load(self.out / "vertices_npy" / f"{clips[number].row['clip']}.npy", mmap_mode="r")
+            motion = open_array(self.out / "vertices_npy" / f"{clips[number].row['clip']}.npy")
             faces.append(motion[frame - starts[number]].reshape(POINTS, 3))
         return np.asarray(np.median(faces, axis=0), np.float32)
 

@@ -19,6 +19,7 @@ from facediff.data.track.tracker import FaceTracker
 from facediff.data.track.video import Picture, read_pictures
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_speech
+from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.batch import FileTask
 from facediff.utils.files import atomic
 from facediff.utils.jobs import PerWorker
@@ -119,10 +120,10 @@ class Recording:
     @classmethod
     def open(cls, task: FileTask) -> Recording:
         """The files of :func:`video_tracker`."""
-        landmarks = np.load(landmark_file(task.output), mmap_mode="r")
-        with np.load(task.output) as arrays:
-            times = arrays["times"] - arrays["times"][0] if len(landmarks) else arrays["times"]
-            return cls(task.source, landmarks, times, arrays["presence"], arrays["speech"], int(arrays["repeated"]))
+        landmarks = open_array(landmark_file(task.output))
+        arrays = read_arrays(task.output, ("times", "presence", "speech", "repeated"))
+        times = arrays["times"] - arrays["times"][0] if len(landmarks) else arrays["times"]
+        return cls(task.source, landmarks, times, arrays["presence"], arrays["speech"], int(arrays["repeated"]))
 
     @property
     def frame_rate(self) -> float:
