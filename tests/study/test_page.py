@@ -77,7 +77,7 @@ def stays_clean(page: Page) -> None:
 def test_served_from_the_first_click_to_the_report(made: Path, serve: Serve, browser: Chromium) -> None:
     address, study = serve(made), read_study(made)
     page = opened(browser, f"{address}/", width=1100, height=800)
-    assert page.evaluate("facediffStudy.served")
+    assert page.evaluate("facediffStudy.hasServer")
     assert page.evaluate("document.getElementById('title').textContent") == "<b>Faces</b> & more"
     assert page.evaluate("document.getElementById('start').disabled")
     begin(page)
@@ -111,7 +111,7 @@ def test_from_a_folder_without_a_network_in_a_narrow_window(made: Path, browser:
     study = read_study(made)
     url = (made / PAGE_FOLDER / "index.html").as_uri()
     page = opened(browser, f"{url}?rater=3", width=390, height=844, dark=True)
-    assert not page.evaluate("facediffStudy.served")
+    assert not page.evaluate("facediffStudy.hasServer")
     select = "document.getElementById('language')"
     page.evaluate(f"{select}.value = 'de', {select}.onchange()")
     assert page.evaluate("document.getElementById('start').textContent") == "Beginnen"
