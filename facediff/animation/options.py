@@ -50,7 +50,7 @@ def scales_text(scales: Scales) -> str:
         return scales
     if isinstance(scales, Mapping):
         return ",".join(f"{name}={scales_text(number)}" for name, number in scales.items())
-    # What is no number is refused by the reader of the text, which names it.
+    # Other texts are refused by the reader of the text, which names it.
     is_number = isinstance(scales, int | float) and not isinstance(scales, bool)
     return repr(float(scales)) if is_number else str(scales)
 
@@ -100,7 +100,7 @@ class GenerationOptions(CheckedOptions):
         sampler: sampler by name, with the checkpoint's spacing and last noise where its steps allow them; see `facediff
             components sampler`
         steps: denoising steps of the sampler
-        expressivity: 0 for the mean of what the model finds possible, 1 for a sample, up to 2 for more than that; or by
+        expressivity: 0 for the predicted mean, 1 for a sample, up to 2 for more than that; or by
             region, lips=0.5,upper_face=1.2 (default: the checkpoint's, usually 1)
         guidance: follow conditions more than the model would by itself, style=1.5,speech=1.2,identity=1.3, where it was
             trained for that (default: the checkpoint's, usually 1)
@@ -147,7 +147,7 @@ class WindowOptions(CheckedOptions):
 
 @dataclass(frozen=True)
 class RecordingOptions(CheckedOptions):
-    """Recordings (what needs the whole recording, and is not for streams).
+    """Recordings (options that need the whole recording, and are not for streams).
 
     Attributes:
         samples: how many animations, with seeds one after another

@@ -92,7 +92,7 @@ class Format(ABC):
 
     @property
     def help(self) -> str:
-        """What the format is, in one line."""
+        """The format in one line."""
         return (inspect.getdoc(self) or "").partition("\n")[0].rstrip(".")
 
 

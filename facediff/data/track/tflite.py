@@ -38,7 +38,7 @@ EMPTY = struct.pack("<HHi", 4, 4, 4)
 CHANNELS_FIRST, CHANNELS_LAST = (0, 3, 1, 2), (0, 2, 3, 1)
 
 
-class Table:
+class FlatTable:
     """A table of a flatbuffer.
 
     Args:
@@ -72,15 +72,15 @@ class Table:
         at = self._position(field)
         return default if at is None else self._read(form, at)
 
-    def table(self, field: int) -> Table:
+    def table(self, field: int) -> FlatTable:
         """A table, without fields if it is missing."""
         at = self._position(field)
-        return Table(EMPTY, 4) if at is None else Table(self.data, at + self._read("I", at))
+        return FlatTable(EMPTY, 4) if at is None else FlatTable(self.data, at + self._read("I", at))
 
-    def tables(self, field: int) -> list[Table]:
+    def tables(self, field: int) -> list[FlatTable]:
         """A list of tables."""
         first, count = self._vector(field)
-        return [Table(self.data, at + self._read("I", at)) for at in range(first, first + 4 * count, 4)]
+        return [FlatTable(self.data, at + self._read("I", at)) for at in range(first, first + 4 * count, 4)]
 
     def numbers(self, field: int, kind: type[np.generic] = np.int32) -> Array:
         """A list of numbers."""
@@ -99,7 +99,7 @@ class Converter:
         with needs_extra("onnx", "onnx", "tracking faces"):
             import onnx
         self.onnx = onnx
-        model = Table(data, struct.unpack_from("<I", data)[0])
+        model = FlatTable(data, struct.unpack_from("<I", data)[0])
         self.codes = [max(code.number(0, "b"), code.number(3)) for code in model.tables(1)]
         self.graph = model.tables(2)[0]
         tensors = self.graph.tables(0)
@@ -161,7 +161,7 @@ class Converter:
         image = len(self.shapes[number]) == 4
         return self.node("Transpose", [self.value(number)], perm=CHANNELS_LAST) if image else self.value(number)
 
-    def operation(self, kind: str, inputs: list[int], result: int, options: Table) -> None:
+    def operation(self, kind: str, inputs: list[int], result: int, options: FlatTable) -> None:
         """Add one operation."""
         output = f"t{result}"
         if options.number(FUSED.get(kind, 99), "b"):
@@ -196,7 +196,7 @@ class Converter:
             self.node(names[kind], list(map(self.value, inputs)), output)
 
 
-def window(options: Table) -> dict[str, Any]:
+def window(options: FlatTable) -> dict[str, Any]:
     """Padding and strides, which have the same numbers in all operations that have a window."""
     padding = "VALID" if options.number(0, "b") else "SAME_UPPER"
     return {"auto_pad": padding, "strides": [options.number(2), options.number(1)]}
