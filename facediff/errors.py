@@ -148,7 +148,7 @@ class OptionError(FaceDiffError):
         option: name of the option as in Python; empty if the message is about something else.
         problem: the fault, the expectation and the remedy. Other options stand in braces: "give {style} as well".
         value: the wrong value, if it is to be shown.
-        place: where the option was read, if not from the user directly: stands in front of the message.
+        location: where the option was read, if not from the user directly: stands in front of the message.
 
     Example:
         >>> error = OptionError("target_mesh", "no such file; omit {correspondence} too", "face.obj")

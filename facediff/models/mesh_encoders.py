@@ -112,8 +112,8 @@ class SpiralDown(nn.Module):
     after the other. The convolution is evaluated only at the vertices that the down-sampling takes.
 
     Args:
-        fine: vertices before the down-sampling.
-        coarse: vertices after it.
+        n_fine: vertices before the down-sampling.
+        n_coarse: vertices after it.
         length: vertices of a spiral.
         in_channels: channels of a vertex.
         out_channels: channels of a vertex after it.
