@@ -316,7 +316,7 @@ def test_a_flawed_folder_gets_one_sentence(
         (["--template", "{tmp}/zeros.npy"], r"zeros\.npy: alignment: the points do not determine a rotation"),
         (["--stable", "{tmp}/beyond.txt"], r"beyond\.txt: .*360"),
         (["--stable", "{tmp}/line.txt"], r"line\.txt: names 2 vertices; expected at least 10"),
-        (["-o", "{tmp}/full"], "full: is a file or not empty"),
+        (["-o", "{tmp}/full"], "full: is not empty"),
         (["-o", "{tmp}/silent.wav/out"], "cannot be written"),
     ],
 )
