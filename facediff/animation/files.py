@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from facediff.animation.animation import Animation, Channels, MotionMap, stretches_of
 from facediff.errors import FaceDiffError, OptionError, check_known, located
 from facediff.spaces import Space
-from facediff.utils.arrays import open_vertices, read_arrays
+from facediff.utils.arrays import open_vertices, read_arrays, write_header
 from facediff.utils.files import atomic
 from facediff.utils.hints import check_number
 from facediff.utils.limits import FRAME_RATES, SAMPLE_RATES, check_format, quoted
@@ -214,35 +214,3 @@ def _checked(path: Path, name: str, array: npt.NDArray[Any], count: int) -> npt.
         )
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
         return array.astype(number_type, copy=False)
-
-
-class MotionWriter:
-    """A .npy file of (frames, V, 3) float32 that grows, so that memory does not hold a long motion.
-
-    Args:
-        path: the file; its header is valid after :meth:`close`.
-        frame: shape of a frame, (V, 3).
-    """
-
-    def __init__(self, path: Path, frame: tuple[int, ...]) -> None:
-        self.path = path
-        self.frame = frame
-        self.frames = 0  # written so far
-        self._stream = path.open("wb")
-        write_header(self._stream, (0, *frame))
-
-    def write(self, vertices: npt.NDArray[np.float32]) -> None:
-        """Add frames (n, V, 3)."""
-        self._stream.write(np.ascontiguousarray(vertices, "<f4").tobytes())
-        self.frames += len(vertices)
-
-    def close(self) -> None:
-        """Write the number of frames into the header."""
-        with self._stream:
-            self._stream.seek(0)
-            write_header(self._stream, (self.frames, *self.frame))
-
-
-def write_header(stream: IO[bytes], shape: tuple[int, ...]) -> None:
-    """The beginning of a .npy file of float32, which may be overwritten: NumPy leaves room for more frames."""
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from facediff.animation import Animation, write_archive
-from facediff.animation.files import MotionWriter
 from facediff.animation.options import ExportOptions
 from facediff.export.format import FileSpace, Format
 from facediff.registry import export_format
@@ -18,6 +17,7 @@ from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files.beat import write_beat
 from facediff.spaces.files.clips import ParameterClip
 from facediff.spaces.layouts import layout
+from facediff.utils.arrays import ArrayWriter
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import Weights
@@ -34,16 +34,12 @@ class Vertices(Format):
         """Write frame by frame."""
         (animation,) = animations
         if animation.without_face and animation.values is not None:
-            channels = MotionWriter(path, animation.values.shape[1:])
-            channels.write(animation.values)
-            channels.close()
+            with ArrayWriter(path, animation.values.shape[1:]) as writer:
+                writer.write(animation.values)
             return
-        writer = MotionWriter(path, animation.template.shape)
-        try:
+        with ArrayWriter(path, animation.template.shape) as writer:
             for frame in FileSpace.of(animation, options).frames(animation):
                 writer.write(frame[None])
-        finally:
-            writer.close()
 
 
 @export_format.register("npz")

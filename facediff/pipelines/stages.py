@@ -35,10 +35,9 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import MotionMap, stretches_of
-from facediff.animation.files import MotionWriter
 from facediff.speech.audio import resampler
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.arrays import open_array
+from facediff.utils.arrays import ArrayWriter, open_array
 
 if TYPE_CHECKING:
     from facediff.editing.acting import Acting
@@ -91,7 +90,7 @@ class Spool:
     def __init__(self, folder: Path | None) -> None:
         self._parts: list[Array] = []
         self._file = None if folder is None else folder / f"{secrets.token_hex(8)}.npy"
-        self._writer: MotionWriter | None = None
+        self._writer: ArrayWriter | None = None
 
     def write(self, part: Array) -> None:
         """Add frames (m, points, dims)."""
@@ -99,7 +98,7 @@ class Spool:
             self._parts.append(part)
             return
         if self._writer is None:
-            self._writer = MotionWriter(self._file, part.shape[1:])
+            self._writer = ArrayWriter(self._file, part.shape[1:])
         self._writer.write(part)
 
     def array(self) -> Array:

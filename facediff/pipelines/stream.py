@@ -138,7 +138,7 @@ def ended_by_interrupt() -> Iterator[Callable[[int, int], bytes]]:
 @contextmanager
 def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray[np.float32]], None]]:
     """Where frames (n, V, 3) go: a .npy file that appears when it is complete, or standard output."""
-    from facediff.animation.files import MotionWriter
+    from facediff.utils.arrays import ArrayWriter
 
     if str(output) == "-":
 
@@ -148,10 +148,6 @@ def sink(output: Path, frame: tuple[int, ...]) -> Iterator[Callable[[npt.NDArray
 
         yield write
         return
-    with atomic(output) as temporary:
-        writer = MotionWriter(temporary, frame)
-        try:
-            yield writer.write
-        finally:
-            writer.close()
-    report(f"{output}: {writer.frames} frames")
+    with atomic(output) as temporary, ArrayWriter(temporary, frame) as writer:
+        yield writer.write
+    report(f"{output}: {writer.rows} frames")

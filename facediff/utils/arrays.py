@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Container
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal
+from typing import IO, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -84,6 +84,43 @@ def read_arrays(
         # Opened here, since NumPy leaves a damaged archive open.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {entry: archive[entry] for entry in archive.files if keys is None or entry in keys}
+
+
+class ArrayWriter:
+    """A .npy file of float32 that grows row by row, so that memory does not hold a long motion.
+
+    Args:
+        path: the file; its header is valid after :meth:`close`, or at the end of a ``with``.
+        row: shape of a row, such as (V, 3) of a frame.
+    """
+
+    def __init__(self, path: Path, row: tuple[int, ...]) -> None:
+        self.row = row
+        self.rows = 0  # written so far
+        self._stream = path.open("wb")
+        write_header(self._stream, (0, *row))
+
+    def write(self, rows: npt.NDArray[np.floating]) -> None:
+        """Add rows (n, *row)."""
+        self._stream.write(np.ascontiguousarray(rows, "<f4").tobytes())
+        self.rows += len(rows)
+
+    def close(self) -> None:
+        """Write the number of rows into the header."""
+        with self._stream:
+            self._stream.seek(0)
+            write_header(self._stream, (self.rows, *self.row))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def write_header(stream: IO[bytes], shape: tuple[int, ...]) -> None:
+    """The beginning of a .npy file of float32, which may be overwritten: NumPy leaves room for more rows."""
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
 
 
 class ArrayStore:

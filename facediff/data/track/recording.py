@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from facediff.data.track.tracker import FaceTracker
 from facediff.data.track.video import Picture, read_pictures
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_speech
-from facediff.utils.arrays import open_array, read_arrays
+from facediff.utils.arrays import ArrayWriter, open_array, read_arrays
 from facediff.utils.batch import FileTask
 from facediff.utils.files import atomic
 from facediff.utils.jobs import PerWorker
@@ -68,8 +68,7 @@ def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[P
     checks, crowds, repeated = 0, 0, 0
     last: Picture | None = None
     target = landmark_file(task.output)
-    with atomic(target) as temporary, temporary.open("wb") as stream:
-        write_header(stream, 0)
+    with atomic(target) as temporary, ArrayWriter(temporary, (LANDMARKS, 3)) as writer:
         for time, picture in read_pictures(task.source):
             if not times or time >= times[0] + checks:  # once a second
                 checks, crowds = checks + 1, crowds + (len(tracker.faces(picture)) > 1)
@@ -77,11 +76,9 @@ def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[P
             repeated += last is not None and sample.shape == last.shape and np.array_equal(sample, last)
             last = sample
             landmarks, logit = tracker.landmarks(picture) or (np.full((LANDMARKS, 3), np.nan), math.nan)
-            stream.write(landmarks.astype("<f4").tobytes())
+            writer.write(landmarks[None])
             times.append(time)
             presence.append(logit)
-        stream.seek(0)
-        write_header(stream, len(times))
     if options.face is None and crowds > OTHERS_SEEN * checks:
         raise FaceDiffError(
             f"{task.source}: shows several faces; say which with --face largest, left, or its number from the left"
@@ -89,12 +86,6 @@ def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[P
     with atomic(task.output) as temporary, temporary.open("wb") as stream:
         np.savez(stream, times=np.array(times), presence=np.array(presence), speech=speech, repeated=repeated)
     return [task.output, target]
-
-
-def write_header(stream: IO[bytes], frames: int) -> None:
-    """The header of a .npy file of landmarks; NumPy leaves room in it for a larger number of frames."""
-    header = {"descr": "<f4", "fortran_order": False, "shape": (frames, LANDMARKS, 3)}
-    np.lib.format.write_array_header_1_0(stream, header)
 
 
 @dataclass(frozen=True, eq=False)
