@@ -13,7 +13,7 @@ from facediff.models.audio_encoders import ConvBlock, Lengths, MelEncoder, Waves
 from facediff.models.layers import Frames, Share, Width, frame_mask
 from facediff.registry import audio_encoder
 from facediff.utils.hub import BUNDLED
-from facediff.utils.protobuf import fields
+from facediff.utils.protobuf import parts, whole_number
 
 GRAPH, PREFIX = "speech.onnx", "model.network.audio_encoder."
 HALF = 10  # ONNX's number of the type
@@ -50,20 +50,19 @@ class BundledEncoder(MelEncoder):
 @cache
 def graph_weights(path: Path) -> dict[str, Tensor]:
     """The weights of the encoder in an exported graph, by their names in PyTorch."""
-    graph = next(content for number, content in fields(path.read_bytes()) if number == 7)
-    parts = list(fields(graph))
+    graph = list(parts(next(content for number, content in parts(path.read_bytes()) if number == 7)))
     arrays: dict[str, Tensor] = {}
-    for tensor in (list(fields(content)) for number, content in parts if number == 5):
-        shape = [int.from_bytes(content, "little") for number, content in tensor if number == 1]
+    for tensor in (list(parts(content)) for number, content in graph if number == 5):
+        shape = [whole_number(content) for number, content in tensor if number == 1]
         facts = dict(tensor)
-        kind = np.float16 if int.from_bytes(facts[2], "little") == HALF else np.float32
+        kind = np.float16 if whole_number(facts[2]) == HALF else np.float32
         if 9 in facts and len(facts[9]) == np.dtype(kind).itemsize * int(np.prod(shape)):
             array = np.frombuffer(facts[9], kind).reshape(shape).astype(np.float32)
             arrays[facts[8].decode().removesuffix("_16")] = torch.from_numpy(array)
     weights = {name.removeprefix(PREFIX): array for name, array in arrays.items() if name.startswith(PREFIX)}
     # The weights of linear layers are transposed and nameless: the bias that is added to their product has the name.
     products: dict[str, str] = {}
-    for node in (list(fields(content)) for number, content in parts if number == 1):
+    for node in (list(parts(content)) for number, content in graph if number == 1):
         inputs = [content.decode() for number, content in node if number == 1]
         kind_of_node, output = dict(node)[4].decode(), dict(node)[2].decode()
         if kind_of_node == "MatMul":

@@ -1,18 +1,17 @@
 """Graphs of ONNX, read before they are run: only known operators, and no other files.
 
-A file is a message of Protocol Buffers (``onnx.proto``), read here as far as needed, since the base install has no
-library for it. Loops, branches, functions and operators that no export needs are refused, as are tensors that lie in
-other files. The time and the memory that a graph takes are not bounded.
+A file is a message of Protocol Buffers (``onnx.proto``). Loops, branches, functions and operators that no export needs
+are refused, as are tensors that lie in other files. The time and the memory that a graph takes are not bounded.
 """
 
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import quoted
+from facediff.utils.protobuf import fields
 
 REMEDY = "get the folder again, or export the model again"
 
@@ -78,36 +77,3 @@ def problem_of_node(content: mmap.mmap, start: int, end: int) -> str:
 def is_external(content: mmap.mmap, start: int, end: int) -> bool:
     """Whether a tensor names another file, or says that its numbers lie in one."""
     return any(number == 13 or (number == 14 and content[at]) for number, at, _ in fields(content, start, end))
-
-
-def fields(content: mmap.mmap, start: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """The fields of a message: their numbers, and where their values lie."""
-    while start < end:
-        key, start = varint(content, start)
-        kind = key & 7
-        if kind == 0:
-            value, (_, start) = start, varint(content, start)
-        elif kind == 2:
-            length, value = varint(content, start)
-            start = value + length
-        else:
-            value, start = start, start + {1: 8, 5: 4}[kind]
-        if start > end:
-            raise ValueError("cut short")
-        yield key >> 3, value, start
-
-
-def varint(content: mmap.mmap, start: int) -> tuple[int, int]:
-    """A whole number of variable length, 7 bits a byte from the lowest on, and where it ends.
-
-    >>> varint(bytes([0xAC, 0x02]), 0)  # type: ignore[arg-type]
-    (300, 2)
-    """
-    value = shift = 0
-    while shift < 64:
-        byte = content[start]
-        value |= (byte & 127) << shift
-        start, shift = start + 1, shift + 7
-        if byte < 128:
-            return value, start
-    raise ValueError("a number of more than 64 bits")

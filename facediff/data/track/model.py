@@ -15,7 +15,7 @@ import numpy.typing as npt
 from facediff.data.track.options import VARIABLE
 from facediff.data.track.tflite import Converter
 from facediff.errors import FaceDiffError
-from facediff.utils.protobuf import fields
+from facediff.utils.protobuf import parts, whole_number
 
 Array = npt.NDArray[np.float64]
 
@@ -74,12 +74,12 @@ def session(graph: bytes) -> Any:  # noqa: ANN401 - ONNX Runtime has no types
 
 def read_geometry(data: bytes) -> tuple[Array, npt.NDArray[np.int64], Array]:
     """Canonical face, triangles and weights of the pose, from MediaPipe's ``GeometryPipelineMetadata``."""
-    parts = list(fields(data))
-    mesh = list(fields(next(content for number, content in parts if number == 1)))
+    geometry = list(parts(data))
+    mesh = list(parts(next(content for number, content in geometry if number == 1)))
     corners = b"".join(content for number, content in mesh if number == 3)  # x, y, z and two texture coordinates each
-    indices = b"".join(content for number, content in mesh if number == 4)
+    indices = np.array([whole_number(content) for number, content in mesh if number == 4])
     weights = np.zeros(POINTS)
-    for point in (dict(fields(content)) for number, content in parts if number == 2):
-        weights[int.from_bytes(point[1], "little")] = struct.unpack("<f", point[2])[0]
+    for point in (dict(parts(content)) for number, content in geometry if number == 2):
+        weights[whole_number(point[1])] = struct.unpack("<f", point[2])[0]
     canonical = np.frombuffer(corners, "<f4").reshape(POINTS, 5)[:, :3].astype(np.float64)
-    return canonical, np.frombuffer(indices, "<i8").reshape(-1, 3), weights
+    return canonical, indices.reshape(-1, 3), weights
