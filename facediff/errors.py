@@ -320,8 +320,8 @@ def damaged(source: object, remedy: str, *errors: type[Exception]) -> Iterator[N
     try:
         yield
     except FaceDiffError as error:
-        located = isinstance(error, MissingExtraError) or str(source) in str(error)
-        raise error if located else error.within(source) from error
+        names_source = isinstance(error, MissingExtraError) or str(source) in str(error)
+        raise error if names_source else error.within(source) from error
     except refusals as error:
         problem = " ".join(str(getattr(error, "strerror", None) or error).split()) or type(error).__name__
         problem = f"has no {problem}" if isinstance(error, KeyError) else problem

@@ -317,9 +317,9 @@ def import_person(
     """
     from facediff.data.corpus import read_manifest
     from facediff.data.person import import_person as import_motion
-    from facediff.data.track.video import SUFFIXES
+    from facediff.speech.audio import VIDEOS
 
-    if motion.suffix.lower() in SUFFIXES:
+    if motion.suffix.lower() in VIDEOS:
         from facediff.data.track.corpus import import_video
 
         tell(*import_video(motion, name, corpus, output, clip_seconds).lines())

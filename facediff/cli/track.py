@@ -135,13 +135,13 @@ def person(
 def with_tracked_styles(style: str, checkpoint: Path | str) -> str:
     """The words of ``--style`` with a motion, on the model's face, in place of each video of a person."""
     from facediff.animation.style_files import split_styles
-    from facediff.data.track.video import SUFFIXES
+    from facediff.speech.audio import VIDEOS
 
-    if not style.lower().endswith(SUFFIXES) and not any(f"{suffix}:" in style.lower() for suffix in SUFFIXES):
+    if not style.lower().endswith(VIDEOS) and not any(f"{suffix}:" in style.lower() for suffix in VIDEOS):
         return style
     names = []
     for part in split_styles(style):
-        is_video = Path(part.name).suffix.lower() in SUFFIXES
+        is_video = Path(part.name).suffix.lower() in VIDEOS
         name = tracked_style(Path(part.name), checkpoint) if is_video else part.name
         names.append(str(name) if part.weight is None else f"{name}:{part.weight!r}")
     return ",".join(names)
@@ -154,8 +154,6 @@ def tracked_style(video: Path, checkpoint: Path | str) -> Path:
     import facediff
     from facediff.data.preparation import write_mesh
     from facediff.data.track.corpus import track_people
-    from facediff.editing.fit_check import refuse_poor
-    from facediff.editing.retargeting import retarget
     from facediff.utils.arrays import ArrayStore
     from facediff.utils.checksums import sha256
     from facediff.utils.files import cache_dir, scratch_folder
@@ -172,7 +170,7 @@ def tracked_style(video: Path, checkpoint: Path | str) -> Path:
             still = model.animate(np.zeros(SAMPLE_RATE, np.float32), SAMPLE_RATE, seed=0)
             face = scratch / "face.ply"
             write_mesh(face, still.template, still.triangles)
-            motion, _ = retarget(motion, face, check=lambda _, __, report: refuse_poor(face, report))
+            motion = motion.retarget(face)
         motion.save(target)
     return target
 

@@ -38,10 +38,8 @@ if TYPE_CHECKING:
     )
 
 SUFFIXES = (".wav", ".flac", ".ogg", ".mp3", ".opus", ".aiff")
-CONTAINERS = (
-    *(".flv", ".m4a", ".mp4", ".mov", ".mkv", ".webm", ".avi", ".aac"),
-    *(".mpg", ".mpeg", ".m4v", ".ts", ".mts", ".wmv", ".3gp"),
-)
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".flv", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".3gp")
+CONTAINERS = (*VIDEOS, ".m4a", ".aac")
 """Videos and similar containers; PyAV extracts their sound."""
 
 DEMUXERS = "flv,mov,mp4,m4a,matroska,webm,avi,aac,mpegts,mpeg,mp3,ogg,wav,flac,aiff,w64,caf"

@@ -37,9 +37,8 @@ from facediff.data.track.model import LICENCE, POINTS, FaceModel, read_face_mode
 from facediff.data.track.options import TrackingOptions
 from facediff.data.track.recording import Recording, RecordingSummary, summarise, video_tracker
 from facediff.data.track.topology import BROWS, EYELID_PAIRS, LIP_PAIRS, LIPS, UPPER_FACE, without_webs
-from facediff.data.track.video import SUFFIXES
 from facediff.errors import FaceDiffError, counted, refuse_idle
-from facediff.speech.audio import SAMPLE_RATE, fit_length, samples_for
+from facediff.speech.audio import SAMPLE_RATE, VIDEOS, fit_length, samples_for
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
@@ -121,13 +120,13 @@ def find_videos(source: Path, name: str | None) -> dict[str, list[Path]]:
                 f"rename the folder"
             )
     if not videos:
-        raise FaceDiffError(f"{source}: holds no videos; expected {', '.join(SUFFIXES)}")
+        raise FaceDiffError(f"{source}: holds no videos; expected {', '.join(VIDEOS)}")
     return videos
 
 
 def videos_in(folder: Path) -> list[Path]:
     """Videos of a folder by name."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEOS and not p.name.startswith("."))
 
 
 def track_people(

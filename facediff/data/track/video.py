@@ -15,7 +15,6 @@ from facediff.utils.limits import brief
 
 Picture = npt.NDArray[np.uint8]
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".flv", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".3gp")
 MOST_PICTURES = 120.0
 """Pictures a second that are looked at; of faster videos every second, third … one."""
 

@@ -271,7 +271,8 @@ class StyleContentDisentanglement(AnimationModel):
         terms |= self.branch_losses(batch, motion, pairing, content, style, style)
         speech_terms = self.branch_losses(batch, motion, pairing, speech_content, speech_style, style)
         terms |= {f"speech_{name}": term for name, term in speech_terms.items()}
-        terms["loss"] = torch.stack([options.weights[name] * term for name, term in terms.items()]).sum()
+        weights = options.weights
+        terms["loss"] = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
         return terms
 
     def branch_losses(
