@@ -79,18 +79,20 @@ def median_face(landmarks: npt.NDArray[np.floating], model: FaceModel) -> Array:
     return face
 
 
+def interpolated(values: Array, times: Array, new_times: Array) -> Array:
+    """Values (T, ...) at rising times, linearly at other ones; constant before the first and after the last."""
+    rows = values.reshape(len(values), -1)
+    low = np.clip(np.searchsorted(times, new_times, side="right") - 1, 0, max(0, len(times) - 2))
+    high = np.minimum(low + 1, len(times) - 1)
+    lengths = np.where(high > low, times[high] - times[low], 1.0)
+    share = ((new_times - times[low]) / lengths)[:, None].clip(0, 1)
+    return ((1 - share) * rows[low] + share * rows[high]).reshape(len(new_times), *values.shape[1:])
+
+
 def filled(values: Array, times: Array) -> Array:
     """Values (T, ...) in which NaN is replaced by interpolation between its neighbours."""
-    rows = values.reshape(len(values), -1)
-    gaps = ~np.isfinite(rows).all(axis=1)
-    if not gaps.any():
-        return values
-    visible = np.flatnonzero(~gaps)
-    position = np.interp(times, times[visible], np.arange(len(visible), dtype=np.float64))
-    low = np.minimum(position.astype(int), max(0, len(visible) - 2))
-    share = (position - low)[:, None]
-    high = np.minimum(low + 1, len(visible) - 1)
-    return ((1 - share) * rows[visible[low]] + share * rows[visible[high]]).reshape(values.shape)
+    visible = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    return values if visible.all() else interpolated(values[visible], times[visible], times)
 
 
 def resampled(values: Array, times: Array, rate: float) -> Array:
@@ -101,11 +103,7 @@ def resampled(values: Array, times: Array, rate: float) -> Array:
         # Rates that differ by less than a part of a frame over the clip are one.
         same = abs(step * rate - 1) * len(times) < EVEN
         return values if same else np.asarray(resample_frames(values, 1 / step, rate))[:count]
-    new = times[0] + np.arange(count) / rate
-    rows = values.reshape(len(values), -1)
-    low = np.clip(np.searchsorted(times, new, side="right") - 1, 0, len(times) - 2)
-    share = ((new - times[low]) / np.diff(times)[low])[:, None].clip(0, 1)
-    return ((1 - share) * rows[low] + share * rows[low + 1]).reshape(count, *values.shape[1:])
+    return interpolated(values, times, times[0] + np.arange(count) / rate)
 
 
 def smooth(motion: Array, rate: float, acceleration: float, variance: float) -> Array:
