@@ -13,7 +13,7 @@ from facediff.animation import Animation
 from facediff.animation.animation import allocate_like
 from facediff.animation.options import Scales, scales_text
 from facediff.editing.eyelids import Array, Eyes, Indices
-from facediff.editing.procedural import EDITED, in_words, with_metadata
+from facediff.editing.procedural import in_words
 from facediff.errors import OptionError, check_known
 from facediff.utils.hints import Range, read
 from facediff.utils.numerics import nearest_distances, smooth_step
@@ -60,13 +60,6 @@ def read_factors(scales: Scales | None, option: str = "expressiveness", highest:
 def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], name: str) -> None:
     """Refuse a region that the face called ``name`` does not have."""
     check_known(name, "region", factors, [*regions, ALL])
-
-
-def scale_regions(
-    animation: Animation, factors: Mapping[str, float | npt.NDArray[np.floating]], eyes: Eyes | None = None
-) -> Animation:
-    """Scale how far every vertex goes from the neutral face; arguments as in :func:`scaled_regions`."""
-    return with_metadata(animation, scaled_regions(animation, factors, eyes), EDITED, expressiveness_words(factors))
 
 
 def expressiveness_words(factors: Mapping[str, float | npt.NDArray[np.floating]]) -> str:

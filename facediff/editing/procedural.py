@@ -47,16 +47,6 @@ WIDENED = -0.5
 """How far an eye may be open beyond the neutral face, as a share of a closing, so that a blink still shuts it."""
 
 
-def add_blinks(animation: Animation, eyes: Eyes, *, rate: Amount = RATE, seed: int = 0) -> Animation:
-    """Let the eyes blink, in addition to any blinks of the animation, see :func:`shut_lids`.
-
-    The head must not sway yet; ``rate`` is blinks a minute, 1 to 40, or as many of each frame, down to 0.
-    """
-    curve = blinks_over_time(len(animation.vertices), animation.frame_rate, rate, seed)
-    vertices = shut_lids(animation, eyes, curve)
-    return with_metadata(animation, vertices, PROCEDURAL, blink_words(rate, seed))
-
-
 def blink_words(rate: Amount, seed: int) -> str:
     """Blinks in the metadata."""
     return f"blinks ({in_words(rate)} a minute, seed {seed})"
@@ -153,15 +143,6 @@ LIDS_PER_DEGREE = 0.012
 """How far the lids close with each degree that the eyes look down, as a share of a full closing (up: they open)."""
 
 
-def add_gaze(animation: Animation, eyes: Eyes, *, degrees: Amount = DEGREES_GAZE, seed: int = 0) -> Animation:
-    """Let the eyes wander: eyeballs turn about their centres, lids follow slightly where their closing is known.
-
-    The head must not sway yet; ``degrees`` is how far from straight ahead the eyes turn at most, or that in each frame.
-    """
-    angles = gaze_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
-    return with_metadata(animation, turn_eyes(animation, eyes, angles), PROCEDURAL, gaze_words(degrees, seed))
-
-
 def gaze_words(degrees: Amount, seed: int) -> str:
     """Gaze in the metadata."""
     return f"gaze ({in_words(degrees)} degrees, seed {seed})"
@@ -255,16 +236,6 @@ WAVES = 6
 AXES = np.array([0.7, 1.0, 0.5])  # How much of the rotation is nodding, shaking and tilting
 SHIFT = 0.004  # Largest shift for each degree of rotation, as a share of the head's height: about a millimetre
 AT_REST = 1.0  # Seconds over which the sway begins and ends
-
-
-def add_sway(animation: Animation, *, degrees: Amount = DEGREES_SWAY, seed: int = 0) -> Animation:
-    """Let the head sway, by ``degrees`` at most, or that in each frame; all vertices move as one.
-
-    Nothing can be added after it.
-    """
-    turns, shifts = sway_over_time(len(animation.vertices), animation.frame_rate, degrees, seed)
-    moved = move_head(animation, turns, shifts)
-    return with_metadata(moved, moved.vertices, PROCEDURAL, sway_words(degrees, seed))
 
 
 def sway_words(degrees: Amount, seed: int) -> str:

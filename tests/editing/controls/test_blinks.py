@@ -9,8 +9,9 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.editing.eyelids import Eyes
-from facediff.editing.procedural import add_blinks, blink_curve
+from facediff.editing.procedural import blink_curve
 from facediff.synthetic.head.parts import build_head
+from tests.fakes.single_controls import add_blinks
 
 
 def pulses(curve: np.ndarray) -> list[tuple[int, int]]:

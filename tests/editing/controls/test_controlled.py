@@ -17,11 +17,10 @@ from facediff.cli.parsing import parameters_of, parse
 from facediff.editing.controlled import apply_controls
 from facediff.editing.controls import check_controls
 from facediff.editing.direction import MOODS, Direction, Key, read_direction
-from facediff.editing.expressiveness import scale_regions
 from facediff.editing.eyelids import Eyes
-from facediff.editing.procedural import add_blinks, add_gaze, add_sway
 from facediff.errors import FaceDiffError
 from facediff.synthetic.known_faces import built_in_rig
+from tests.fakes.single_controls import add_blinks, add_gaze, add_sway, scale_regions
 
 
 def parsed(*words: str) -> AnimationControls:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.expressiveness import FALL_OFF, region_factors, scale_regions
+from facediff.editing.expressiveness import FALL_OFF, region_factors
 from facediff.editing.eyelids import Eyes
+from tests.fakes.single_controls import scale_regions
 
 
 def test_one_factor_scales_every_offset(make_animation: Callable[..., Animation]) -> None:

@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.expressiveness import scale_regions
 from facediff.editing.eyelids import Eyes
 from facediff.editing.procedural import (
-    add_blinks,
-    add_gaze,
-    add_sway,
     gaze_curve,
     gaze_rotations,
     sphere_centre,
     sway_curve,
 )
 from facediff.mesh import robust_align
+from tests.fakes.single_controls import add_blinks, add_gaze, add_sway, scale_regions
 
 
 def test_gaze_stays_in_its_bounds_and_begins_and_ends_straight_ahead() -> None:
