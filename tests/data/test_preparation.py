@@ -153,10 +153,6 @@ def test_errors_that_concern_every_clip_stop_the_run(tmp_path: Path, error: Face
     assert not (out / "manifest.json").exists()
 
 
-def killing(out: Path) -> int:
-    os._exit(9)
-
-
 def test_other_options_are_refused(tmp_path: Path) -> None:
     out = tmp_path / "out"
     prepare(toy_plan(options={"dtype": "float32", "subjects": ["A", "B"]}), out, workers=1)

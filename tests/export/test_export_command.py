@@ -55,5 +55,5 @@ def test_what_a_file_says_of_its_own_rate_and_unit_stands(
     assert main(["export", str(source), "-o", str(out), option, own]) == 0
     out.unlink()
     assert main(["export", str(source), "-o", str(out), option, wrong]) == 2
-    assert f": in.npz has {own}" in capsys.readouterr().err
+    assert f"in.npz has {own}" in capsys.readouterr().err
     assert not out.exists()

@@ -12,10 +12,6 @@ from typing import Literal
 import numpy as np
 import soundfile
 
-from tests.fakes.biwi import faces_of, ply_bytes, write_regions
-from tests.fakes.flame import VERTICES
-from tests.fakes.vocaset import flame_masks, python2_pickle, template_of
-
 EMOTIONS = ("neutral", "happy", "sad", "surprised", "fear", "disgusted", "angry", "contempt")
 CLIPS = (
     *("M003_001_0_0", "M003_002_0_0", "M003_033_0_0", "M003_037_0_0"),
@@ -131,25 +127,4 @@ def write_raw_probtalk3d(root: Path, *, clips: Sequence[str] = CLIPS) -> Path:
         parts = parameters_of(name)
         np.save(root / "param" / f"{name}.npy", np.concatenate([parts["shape"], parts["exp"], parts["jaw"]], 1)[None])
         write_wav(root / "wav" / f"{name}.wav", speech_of(name))
-    return root
-
-
-def write_mead3d(root: Path, *, vertices: int = VERTICES, clips: Sequence[str] = CLIPS) -> Path:
-    """Write the prepared layout. The lower half of the face drops as the tone grows loud; the brows waver."""
-    (root / "vertices_npy").mkdir(parents=True)
-    faces = {name[:4]: template_of(f"MEAD_{name[0]}_{name[1:4]}", vertices) for name in clips}
-    rows = ["clip,subject,sentence,emotion,intensity"]
-    for name in clips:
-        motion = np.repeat(faces[name[:4]][None], frames_of(name), 0)
-        motion[:, vertices // 2 :, 1] -= 0.01 * loudness(name)[:, None]
-        motion[:, : vertices // 4, 1] += 0.002 * np.sin(np.arange(frames_of(name)) / 5)[:, None]
-        np.save(root / "vertices_npy" / f"{name}.npy", motion.reshape(len(motion), -1).astype(np.float32))
-        write_wav(root / "wav" / f"{name}.wav", speech_of(name, 16_000), 16_000)
-        emotion = EMOTIONS[int(name[9])]
-        rows.append(f"{name},{name[:4]},{emotion}_{name[5:8]},{emotion},{int(name[11]) + 1}")
-    (root / "clips.csv").write_text("\n".join(rows) + "\n")
-    (root / "templates.pkl").write_bytes(python2_pickle(faces))
-    (root / "FLAME_masks.pkl").write_bytes(python2_pickle(flame_masks(vertices)))
-    (root / "FLAME.ply").write_bytes(ply_bytes(next(iter(faces.values())), faces_of(vertices), "float", "int"))
-    write_regions(root, vertices, ",")
     return root

@@ -34,7 +34,7 @@ def test_statistics_against_numpy() -> None:
 @pytest.mark.parametrize("frames", [1, 5, 64, 300])
 def test_positions_serve_any_length(frames: int) -> None:
     """With a silent GRU and no layers only the positions are left."""
-    encoder = TcnGruTransformer(dim=DIM, num_layers=0, n_positions=64).eval()
+    encoder = TcnGruTransformer(dim=DIM, num_heads=1, num_layers=0, n_positions=64).eval()
     for parameter in encoder.gru.parameters():
         nn.init.zeros_(parameter)
     encoder.norm = nn.Identity()

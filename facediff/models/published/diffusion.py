@@ -128,20 +128,12 @@ class PosteriorSampler(Sampler):
         """The mean of q(xₙ₋₁ | xₙ, x̂₀) and new noise; in the last step the prediction alone."""
         if i == self.steps - 1:
             return predictions[-1]
-        beta, signal_now, signal_after = (
-            float(self.process.variances[self.timesteps[i]]),
-            self.signal[i],
-            self.signal[i + 1],
-        )
-        of_clean, of_noisy = (
-            beta * math.sqrt(signal_after) / (1 - signal_now),
-            (1 - signal_after) * math.sqrt(1 - beta) / (1 - signal_now),
-        )
-        return (
-            of_clean * predictions[-1]
-            + of_noisy * noisy
-            + math.sqrt(beta * (1 - signal_after) / (1 - signal_now)) * noise(noisy)
-        )
+        beta = float(self.process.variances[self.timesteps[i]])
+        signal_now, signal_after = self.signal[i], self.signal[i + 1]
+        of_clean = beta * math.sqrt(signal_after) / (1 - signal_now)
+        of_noisy = (1 - signal_after) * math.sqrt(1 - beta) / (1 - signal_now)
+        deviation = math.sqrt(beta * (1 - signal_after) / (1 - signal_now))
+        return of_clean * predictions[-1] + of_noisy * noisy + deviation * noise(noisy)
 
 
 class SeededNoise:
