@@ -7,6 +7,8 @@ from itertools import product
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from facediff.spaces.arkit import ARKIT, LEFT_AND_RIGHT
 from facediff.synthetic.head.mesh import QuadMesh
@@ -70,6 +72,23 @@ def crossings(vertices: Array, faces: NDArray[np.int64], among: NDArray[np.int64
         hit &= depth > TOUCHING
         pairs += [(number, int(face)) for face in candidates[hit]]
     return pairs
+
+
+def test_every_part_looks_outwards(mesh: QuadMesh) -> None:
+    """No neighbours disagree on the side they show, and every part with an inside has a positive volume."""
+    faces = mesh.faces
+    directed = np.concatenate([faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    assert len(np.unique(directed, axis=0)) == len(directed)
+    count = len(mesh.vertices)
+    links = coo_array((np.ones(len(directed)), tuple(directed.T)), (count, count))
+    label = connected_components(links, directed=False)[1][faces[:, 0]]
+    first, second, third = (mesh.vertices[faces[:, corner]] for corner in range(3))
+    for part in np.unique(label):
+        triangles = label == part
+        centre = first[triangles].mean(axis=0)
+        corners = (points[triangles] - centre for points in (first, second, third))
+        volume = np.linalg.det(np.stack(list(corners), axis=1)).sum() / 6
+        assert volume > 100 or triangles.sum() < 10  # lashes and glints are flat
 
 
 def test_the_head_is_made_of_quads_and_symmetric(mesh: QuadMesh) -> None:

@@ -67,11 +67,12 @@ class HalfQuadMesh:
         """The points of a group, (n, 3)."""
         return np.concatenate(self.points)[self.groups[name]]
 
-    def strips(self, loops: Sequence[Index], *, closed: bool = False) -> None:
-        """Join loops of equal length, each to the next; the first runs clockwise round the others from outside."""
+    def strips(self, loops: Sequence[Index], *, closed: bool = False, clockwise: bool = True) -> None:
+        """Join loops of equal length, each to the next; from outside, the first runs clockwise round the others."""
         for outer, inner in zip(loops, loops[1:], strict=False):
             a, b = (np.append(outer, outer[0]), np.append(inner, inner[0])) if closed else (outer, inner)
-            self.quads.append(np.stack([a[:-1], b[:-1], b[1:], a[1:]], axis=1))
+            corners = [a[:-1], b[:-1], b[1:], a[1:]] if clockwise else [a[:-1], a[1:], b[1:], b[:-1]]
+            self.quads.append(np.stack(corners, axis=1))
 
     def fan(self, loop: Index, centre: int, *, closed: bool = True) -> None:
         """Join a loop to a point."""

@@ -86,7 +86,7 @@ def _add_skin(half: HalfQuadMesh, layout: Layout) -> None:
     index = half.add("skin", points, colours)
     half.groups["skin_shirt"] = index[covered]
     half.quads.append(index[layout.quads])
-    half.fan(layout.top, int(half.add("crown", [_CROWN], SKIN)[0]), closed=False)
+    half.fan(layout.top[::-1], int(half.add("crown", [_CROWN], SKIN)[0]), closed=False)
 
 
 def _add_mouth(half: HalfQuadMesh, layout: Layout) -> None:
@@ -320,8 +320,8 @@ def _add_teeth(half: HalfQuadMesh) -> None:
             # Little light reaches the back of the mouth.
             dark = 1.0 - 0.6 * rise(turn, np.deg2rad(15.0), np.deg2rad(60.0))
             loops.append(half.add(f"teeth_{jaw}_{name}", points, dark[:, None] * np.array(colour)))
-        # A strip's first row runs clockwise round the next one: outwards the two arches lie the opposite way round.
-        half.strips(loops[::-1])
+        # From the gum in front to the gum behind, the upper arch's loops follow one another downwards.
+        half.strips(loops[::-1], clockwise=jaw == "lower")
 
 
 def _add_tongue(half: HalfQuadMesh) -> None:
@@ -339,7 +339,7 @@ def _add_tongue(half: HalfQuadMesh) -> None:
         points = np.stack([x, y, np.full_like(x, front - 42.0 * position)], axis=1)
         points[[0, -1], 0] = 0.0
         loops.append(half.add(f"tongue_{number}", points, _TONGUE))
-    half.strips(loops)
+    half.strips(loops, clockwise=False)
 
 
 def _add_hair(half: HalfQuadMesh) -> None:
@@ -349,7 +349,7 @@ def _add_hair(half: HalfQuadMesh) -> None:
     grid = half.add("hair", points, shade[:, None] * np.array(HAIR)).reshape(HAIR_ROWS, HAIR_COLUMNS)
     half.strips(list(grid[::-1]))
     crown = half.add("hair_crown", [top], 0.92 * np.array(HAIR))
-    half.fan(grid[-1], int(crown[0]), closed=False)
+    half.fan(grid[-1][::-1], int(crown[0]), closed=False)
 
 
 def _add_brow(half: HalfQuadMesh) -> None:

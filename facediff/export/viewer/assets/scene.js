@@ -57,7 +57,8 @@ void main() {
   wide *= wide; // 16
   float narrow = wide * wide; // 32
   vec3 lit = open * (albedo * light + 0.096 * wide * shine + 0.064 * narrow * narrow);
-  if (!gl_FrontFacing) lit = mix(vec3(0.10, 0.02, 0.015), lit, 0.18); // the hollow of the mouth is dark and warm
+  // Backs are dark: warm behind skin, as the hollow of a mouth, and without a tint behind hair.
+  if (!gl_FrontFacing) lit = mix(albedo * vec3(0.12, 0.04, 0.035), lit, 0.18);
   colour = vec4(sqrt(lit), 1.0);
 }`;
 
