@@ -144,9 +144,10 @@ def animate_recording(
     options: AnimationOptions, speech: Path, output: Path, files: ExportOptions, *, yes: bool
 ) -> None:
     """Animate one recording, and report the files written."""
+    from facediff.editing.controls import direction_for
     from facediff.export import check_export
     from facediff.export.writing import seeks_weights
-    from facediff.pipelines.animate import check_options, direction_for
+    from facediff.pipelines.animate import check_options
     from facediff.pipelines.trained import open_pipeline
     from facediff.speech.audio import read_recording
     from facediff.speech.voice_activity import speech_problems

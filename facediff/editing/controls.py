@@ -58,6 +58,20 @@ def refuse_folder(direction: DirectionLike | None) -> None:
         raise OptionError("direction", "is a folder, of keys for recordings by their names; give one file", folder)
 
 
+def direction_for(direction: DirectionLike, recording: Path) -> DirectionLike:
+    """The keys over time of one recording, where a folder has a file for each."""
+    folder = keys_file(direction)
+    if folder is None or not folder.is_dir():
+        return direction
+    from facediff.editing.direction import direction_file
+
+    if (file := direction_file(folder, recording)) is None:
+        raise OptionError(
+            "direction", f"has no {recording.stem}.json or {recording.stem}.csv; give the file's name", folder
+        )
+    return file
+
+
 def keys_of(direction: DirectionLike | None, frame_rate: float | None = None) -> Direction | None:
     """The keys over time; None if there are none, or each recording of a folder has its own.
 

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from facediff.animation import Animation
-from facediff.animation.options import AnimationOptions, DirectionLike, ExportOptions, Scales, scales_text
-from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
+from facediff.animation.options import AnimationOptions, ExportOptions, Scales, scales_text
+from facediff.editing.controls import check_controls, is_procedural, keys_of
 from facediff.errors import OptionError, refuse_idle
 from facediff.pipelines.stages import (
     Act,
@@ -408,18 +408,3 @@ def read_scales(guidance: Scales | None) -> dict[str, float]:
             )
         scales[name.strip()] = ranges.GUIDANCE_SCALE.read(f"{{guidance}}: {name.strip()}", number.strip())
     return scales
-
-
-def direction_for(direction: DirectionLike, recording: Path, *, streamed: bool = False) -> DirectionLike:
-    """The keys over time of one recording, where a folder has a file for each."""
-    folder = keys_file(direction)
-    if folder is None or not folder.is_dir():
-        return direction
-    from facediff.editing.direction import direction_file
-
-    file = None if streamed else direction_file(folder, recording)
-    if file is None:
-        raise OptionError(
-            "direction", f"has no {recording.stem}.json or {recording.stem}.csv; give the file's name", folder
-        )
-    return file

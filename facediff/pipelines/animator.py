@@ -22,9 +22,9 @@ from facediff.animation.options import (
     StreamKeywords,
     with_options,
 )
-from facediff.editing.controls import keys_of, refuse_folder
+from facediff.editing.controls import direction_for, keys_of, refuse_folder
 from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
-from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options, direction_for
+from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options
 from facediff.pipelines.motion import Samples
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hints import check_number

@@ -9,13 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationOptions, ExportOptions, RecordingOptions
+from facediff.editing.controls import refuse_folder
 from facediff.errors import FaceDiffError, OptionError, refuse_idle
-from facediff.pipelines.animate import check_options, direction_for
+from facediff.pipelines.animate import check_options
 from facediff.pipelines.trained import open_pipeline
 from facediff.speech.pcm import pcm
 from facediff.utils.files import atomic, check_writable
@@ -70,8 +70,7 @@ WHOLE = (
 
 def check_stream(options: AnimationOptions, output: Path, export: ExportOptions) -> None:
     """Refuse options that need the whole animation."""
-    if options.direction is not None:
-        options = replace(options, direction=direction_for(options.direction, Path("-"), streamed=True))
+    refuse_folder(options.direction)
     check_options(options)
     if str(output) != "-" and output.suffix != ".npy":
         raise OptionError(
