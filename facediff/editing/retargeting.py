@@ -183,21 +183,27 @@ def transfer_checked(
     """The motion of an animation on a target mesh, the correspondence that carried it, and the fit report.
 
     Where a result is poor, its eyes are carried another way: lids go the share of their own opening, if they did not
-    yet, and else stay at rest. That result counts if nothing else is wrong.
+    yet, and else stay at rest. That result counts if nothing else is wrong. The face is measured without the motion of
+    the head as a whole, for which no mesh needs a place.
     """
-    carried = transfer(animation, correspondence, target, whole_head)
-    report = check_fit(animation, carried, correspondence)
+    still = animation.still()
+
+    def turned_as_the_head(moved: Animation, fit: Correspondence) -> Animation:
+        return _with_head(moved, animation.head, fit, whole_head)
+
+    carried = transfer(still, correspondence, target)
+    report = check_fit(still, carried, correspondence)
     faults = report.faults
     for lids in (LIDS_FITTED, LIDS_AT_REST):
         if report.good or report.eyes is None or correspondence.lids >= lids:
             continue
         variant = replace(correspondence, lids=lids)
-        moved = transfer(animation, variant, target, whole_head)
-        again = check_fit(animation, moved, variant)
+        moved = transfer(still, variant, target)
+        again = check_fit(still, moved, variant)
         if again.good:
             why = [f"lids in motion were worse: {faults[0]}"] if lids == LIDS_AT_REST else []
-            return moved, variant, replace(again, remarks=(*again.remarks, *why))
-    return carried, correspondence, report
+            return turned_as_the_head(moved, variant), variant, replace(again, remarks=(*again.remarks, *why))
+    return turned_as_the_head(carried, correspondence), correspondence, report
 
 
 def transfer(animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False) -> Animation:
@@ -233,11 +239,9 @@ def transfer(animation: Animation, correspondence: Correspondence, target: Mesh,
         vertices[some] = rest + transfer_displacements(
             correspondence, np.asarray(animation.vertices[some], np.float64) - neutral
         )
-    head = None if head is None else _carried_head(vertices, rest, head, correspondence, whole_head)
-    return Animation(
+    carried = Animation(
         name=animation.name,
         vertices=vertices,
-        head=head,
         template=rest.astype(np.float32),
         frame_rate=animation.frame_rate,
         faces=np.asarray(target.faces, np.int32),
@@ -252,15 +256,20 @@ def transfer(animation: Animation, correspondence: Correspondence, target: Mesh,
             "carried": f"from a mesh of {len(neutral)} vertices to one of {len(rest)} by nearest points of its surface",
         },
     )
+    return _with_head(carried, head, correspondence, whole_head)
 
 
 NECK = 0.5  # Below a head, its motion as a whole fades over this share of the source's height: a body stands still
 
 
-def _carried_head(
-    vertices: npt.NDArray[np.float32], rest: Array, head: Array, correspondence: Correspondence, whole_head: bool
-) -> Array | None:
-    """Move vertices (T, V, 3) as a head does, eyes and hair included; the motion (T, 6), if all of them move so."""
+def _with_head(carried: Animation, head: Array | None, correspondence: Correspondence, whole_head: bool) -> Animation:
+    """Move an animation on the target, eyes and hair included, as the source's head (T, 6) does: in place.
+
+    The result's own ``head`` is set if all of its vertices move so.
+    """
+    if head is None:
+        return carried
+    vertices, rest = carried.vertices, np.asarray(carried.template, np.float64)
     similarity = correspondence.similarity
     turns = head[:, :3] @ similarity.rotation.T  # axes turn with the mesh
     matrices = rotations(turns)
@@ -281,7 +290,7 @@ def _carried_head(
             moved = frame @ matrix.T + shift
             vertices[index] = moved if whole_head else frame + share[:, None] * (moved - frame)
     shifts[~head.any(axis=1)] = 0.0
-    return np.concatenate([turns, shifts], axis=1) if whole_head else None
+    return replace(carried, head=np.concatenate([turns, shifts], axis=1)) if whole_head else carried
 
 
 def transfer_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:

@@ -57,7 +57,7 @@ def draw_correspondence(path: Path, animation: Animation, carried: Animation, co
         carried: the same on the target mesh.
         correspondence: the correspondence between them.
     """
-    frames = telling_frames(animation, correspondence)
+    frames = telling_frames(animation.still(), correspondence)
     opening = mouth_opening(animation)
     if opening is not None:
         frames["widest mouth"] = int(opening.argmax())

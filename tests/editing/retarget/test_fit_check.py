@@ -16,6 +16,7 @@ from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
 from facediff.editing.fit_check import check_fit
 from facediff.editing.retargeting import transfer, transfer_checked
 from facediff.mesh import Mesh
+from facediff.mesh.flame import rotations
 from facediff.mesh.mesh import triangle_areas
 from tests.fakes.heads import FAMILY, INTERIOR, Head, person, sealed_lips, talking
 from tests.fakes.small_face import M2, Shape, small_shapes
@@ -73,6 +74,23 @@ def test_a_head_from_elsewhere_speaks_or_is_refused(animation: Animation, name: 
     assert expected is not None
     own = np.linalg.norm(animation.vertices[3, expected[:, 0]] - animation.vertices[3, expected[:, 1]], axis=1).mean()
     assert gaps[3] - gaps[0] == pytest.approx(found.similarity.scale * own, rel=0.35)
+
+
+def test_a_nod_needs_no_place_on_the_mesh(animation: Animation) -> None:
+    """Acting turns the head as a whole: a mask is judged by its face, and carried with the nod."""
+    head = FAMILY["slit mask"]()
+    mesh = Mesh(head.vertices, head.faces.astype(np.int32))
+    found = correspond(animation.template, animation.triangles, head.vertices, head.faces)
+    nods = np.zeros((len(animation.vertices), 6))
+    nods[1:, 0] = 0.5
+    with_nods = np.einsum("tij,tvj->tvi", rotations(nods[:, :3]), animation.vertices).astype(np.float32)
+    nodding = replace(animation, vertices=with_nods, head=nods)
+    _, _, report = transfer_checked(animation, found, mesh)
+    made, _, same = transfer_checked(nodding, found, mesh)
+    assert report.covered == pytest.approx(same.covered, abs=1e-3)
+    assert (same.good, same.faults) == (True, ())
+    assert np.allclose(made.vertices, transfer(nodding, found, mesh).vertices)
+    assert np.ptp(made.vertices[1] - made.template, axis=0)[2] > 0.02 * found.similarity.scale
 
 
 @pytest.mark.slow
