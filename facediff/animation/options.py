@@ -237,19 +237,20 @@ class TargetOptions(CheckedOptions):
     Attributes:
         target_mesh: transfer the motion to this mesh
         correspondence: .npz of that mesh, to use if it exists, else to write
-        own_shapes: of a target .glb, drive its own shapes (ARKit's, VRM's or Oculus' names) and bones, and add none
+        carry: move the surface of a target .glb that has shapes of its own (ARKit's, VRM's or Oculus' names), which
+            else play the motion by their names, with its bones for head, eyes and jaw
+        own_shapes: whether these shapes play it, which depends on the file to write as well
     """
 
     target_mesh: Annotated[FilePath | None, Option(metavar="FILE", reads=True)] = None
     correspondence: Annotated[FilePath | None, Option(metavar="MAP", reads=True, writes="file")] = None
-    own_shapes: bool = False
+    carry: bool = False
+    own_shapes: Annotated[bool, Option(hidden=True)] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.correspondence is not None and self.target_mesh is None:
             raise OptionError("correspondence", "belongs to a mesh; give {target_mesh} as well")
-        if self.own_shapes and Path(self.target_mesh or "").suffix.lower() != ".glb":
-            raise OptionError("own_shapes", "drives the shapes of an avatar; give its .glb as {target_mesh}")
 
 
 @dataclass(frozen=True)
@@ -372,7 +373,7 @@ class AnimationOptions(
 
 NAMED_ELSEWHERE = (
     *("checkpoint", "identity", "style", "seed", "expressivity", "guidance", "direction"),
-    *("samples", "quiet", "device", "commercial_only"),
+    *("samples", "quiet", "device", "commercial_only", "own_shapes"),
 )
 """Options of a take that its metadata name by themselves, that its page asks for, or that change nothing in it."""
 

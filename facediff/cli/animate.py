@@ -22,7 +22,7 @@ from facediff.cli.parsing import changed
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils import ranges
-from facediff.utils.files import example_recording, holds_glb
+from facediff.utils.files import example_recording
 from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.option import Option
 
@@ -124,6 +124,11 @@ def animate(
 
         words = with_tracked_styles(generation.style, checkpoint)
         generation = replace(generation, style=words)
+    if target.target_mesh is not None and not target.carry and not stream:
+        from facediff.export.glb_own_shapes import shapes_to_drive
+
+        avatar = shapes_to_drive(Path(target.target_mesh), Path(f"a{batch.suffix}") if is_batch else output)
+        target = replace(target, own_shapes=avatar is not None)
     options = AnimationOptions.of(
         generation, windows, recording, controls, target, device, licence, checkpoint=checkpoint, quiet=quiet
     )
@@ -175,7 +180,7 @@ def animate_recording(
         line = "next to it"
     if options.target_mesh is not None:
         from facediff.cli.retarget import surface_notes
-        from facediff.export.glb_own_shapes import own_shapes, unused_shapes
+        from facediff.export.glb_own_shapes import own_shapes
 
         mesh = Path(options.target_mesh)
         fit_notes = [] if pipeline.retarget is None else pipeline.retarget.notes
@@ -183,5 +188,3 @@ def animate_recording(
         if options.own_shapes:
             avatar = own_shapes(mesh)
             tell(avatar.summary, *avatar.left_out(animation))
-        elif holds_glb(output):
-            tell(*unused_shapes(mesh))

@@ -40,9 +40,8 @@ class TransferOptions:
         add_to_mesh: write the target .glb itself with the animation added; UVs, materials, skins and targets stay
             (default for a .glb from a .glb that has materials, skins or targets)
         bare_face: write the animated surface alone, without the other parts of the target .glb
-        own_shapes: of a target .glb, drive its own shapes (ARKit's, VRM's or Oculus' names) and its bones for head,
-            eyes and jaw, and add none. Weights go by name where the motion has ARKit's or is of the built-in face,
-            without any search; else they are solved for on the target
+        carry: move the surface of a target .glb that has shapes of its own (ARKit's, VRM's or Oculus' names), which
+            else play the motion by their names, with its bones for head, eyes and jaw
         quiet: print the files and warnings alone
     """
 
@@ -52,9 +51,9 @@ class TransferOptions:
     pick: bool = False
     show: Picture = None
     accept_poor: bool = False
-    add_to_mesh: Annotated[bool, Option(without="bare_face own_shapes")] = False
-    bare_face: Annotated[bool, Option(without="own_shapes")] = False
-    own_shapes: bool = False
+    add_to_mesh: Annotated[bool, Option(without="bare_face")] = False
+    bare_face: bool = False
+    carry: Annotated[bool, Option(without="add_to_mesh bare_face")] = False
     quiet: bool = False
 
 
@@ -80,9 +79,8 @@ def retarget(
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
     both_glb = holds_glb(output) and target_mesh.suffix.lower() == ".glb" and output != target_mesh
-    if (transfer.add_to_mesh or transfer.own_shapes) and not both_glb:
-        option = "--add-to-mesh" if transfer.add_to_mesh else "--own-shapes"
-        raise FaceDiffError(f"{option}: expected two different .glb, not {target_mesh} and {output}; name them so")
+    if transfer.add_to_mesh and not both_glb:
+        raise FaceDiffError(f"--add-to-mesh: expected two different .glb, not {target_mesh} and {output}; name them so")
     check_source(source)
     if transfer.pick:
         picked = landmarks_path(transfer.correspondence or output)
@@ -92,7 +90,7 @@ def retarget(
 
     from facediff.editing.blendshapes import has_arkit_weights
     from facediff.export import ExportOptions, check_export, write_animations
-    from facediff.export.glb_own_shapes import own_shapes
+    from facediff.export.glb_own_shapes import shapes_to_drive
     from facediff.mesh.glb import has_materials_or_targets
     from facediff.pipelines.motion import SourceReader
 
@@ -100,12 +98,13 @@ def retarget(
     dressed = transfer.add_to_mesh or (
         not transfer.bare_face and holds_glb(output) and has_materials_or_targets(target_mesh)
     )
-    avatar = own_shapes(target_mesh) if transfer.own_shapes else None
+    carries = transfer.carry or transfer.add_to_mesh or transfer.bare_face
+    avatar = None if carries else shapes_to_drive(target_mesh, output)
     motion = SourceReader(source).read(animation)
-    driven = [] if avatar is None else [avatar.summary, *avatar.left_out(motion)]
-    if avatar is not None and has_arkit_weights(motion):
-        idle = {name: is_set for name, is_set in changed(transfer).items() if name not in ("own_shapes", "quiet")}
-        refuse_idle("has no effect, since the motion's weights go by name to --own-shapes", **idle)
+    driven = None if avatar is None else [avatar.summary, *avatar.left_out(motion)]
+    if driven is not None and has_arkit_weights(motion):
+        idle = {name: is_set for name, is_set in changed(transfer).items() if name != "quiet"}
+        refuse_idle(f"has no effect without {{carry}}, since {target_mesh.name} has shapes of its own", **idle)
         written = write_animations(output, [motion], ExportOptions(), into=target_mesh, own_shapes=True)
         tell(*written, *([] if transfer.quiet else driven))
         return
@@ -116,7 +115,7 @@ def retarget(
 
 
 def write_transferred(
-    motion: Animation, target: Path, output: Path, options: TransferOptions, *, dressed: bool, driven: list[str]
+    motion: Animation, target: Path, output: Path, options: TransferOptions, *, dressed: bool, driven: list[str] | None
 ) -> None:
     """Transfer a motion by the surface, write it, and report how well it fits.
 
@@ -126,12 +125,11 @@ def write_transferred(
         output: file to write.
         options: of the command.
         dressed: whether a copy of the target's file is written, with materials, skins and targets.
-        driven: notes on the target's own shapes.
+        driven: notes on the target's own shapes, if they play the motion.
     """
     from facediff.editing.fit_check import refuse_poor
     from facediff.editing.retargeting import has_z_up, retarget
     from facediff.export import ExportOptions, write_animations
-    from facediff.export.glb_own_shapes import unused_shapes
     from facediff.export.pictures import draw_correspondence
     from facediff.mesh.textures import hands_on_textures
 
@@ -151,22 +149,20 @@ def write_transferred(
         options.landmarks,
         parts=options.part or (),
         check=judge,
-        whole_head=options.own_shapes,
+        whole_head=driven is not None,
     )
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
-    if options.own_shapes:
+    if driven is not None:
         notes += driven
     elif dressed and not options.add_to_mesh:
         notes.append(f"in a copy of {target.name} with its materials, skins and targets; --bare-face omits them")
-        notes += unused_shapes(target)
     notes += surface_notes(target, output, transferred)
-    copied = dressed or options.own_shapes
-    into = target if copied or hands_on_textures(target, output) else None
+    into = target if dressed or hands_on_textures(target, output) else None
     written = write_animations(
-        output, [transferred], ExportOptions(), into=into, own_shapes=options.own_shapes, z_up=has_z_up(fit)
+        output, [transferred], ExportOptions(), into=into, own_shapes=driven is not None, z_up=has_z_up(fit)
     )
     written += [] if options.show is None else [options.show]
-    lines = [*remarks(motion, transferred, fit, reports[-1]), *axes_notes(fit, output, copied), *notes]
+    lines = [*remarks(motion, transferred, fit, reports[-1]), *axes_notes(fit, output, dressed), *notes]
     tell(*written, *(line for line in lines if not options.quiet or line.startswith("WARNING")))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +30,7 @@ from facediff.spaces.arkit import ARKIT, arkit_name, plain
 from facediff.spaces.files.tables import gaze
 from facediff.spaces.rotations import convert, matrices
 from facediff.spaces.visemes import OCULUS, VRM
+from facediff.utils.files import holds_glb
 
 Array = npt.NDArray[np.float64]
 Kind = Literal["ARKit", "Oculus", "VRM"]
@@ -87,7 +89,7 @@ class OwnShapes:
         bones = ", ".join(self.names.values())
         return (
             f"{len(self.binds)} shapes of its own ({self.kind}) in {len(meshes)} meshes play it; bones for head, jaw "
-            f"and gaze: {bones or 'none'}"
+            f"and gaze: {bones or 'none'}. --carry moves its surface instead"
         )
 
     def left_out(self, animation: Animation) -> list[str]:
@@ -109,13 +111,12 @@ def own_shapes(target: Path) -> OwnShapes:
         return _own_shapes(open_glb(target))
 
 
-def unused_shapes(target: Path) -> list[str]:
-    """A sentence for users if the avatar has shapes that the option would drive; else none."""
-    try:
-        avatar = own_shapes(target)
-    except FaceDiffError:
-        return []
-    return [f"{target.name} has {len(avatar.binds)} own shapes ({avatar.kind}); --own-shapes drives them and adds none"]
+def shapes_to_drive(target: Path, output: Path) -> OwnShapes | None:
+    """The shapes and bones of an avatar that play a motion in a file; None if one of both has no place for them."""
+    if target.suffix.lower() == ".glb" and holds_glb(output):
+        with suppress(FaceDiffError):
+            return own_shapes(target)
+    return None
 
 
 def drive_avatar(path: Path, target: Path, animation: Animation) -> None:
@@ -183,7 +184,7 @@ def _own_shapes(glb: Glb) -> OwnShapes:
     if kind is None:
         raise FaceDiffError(
             f"{glb.source}: has no shapes for a mouth under names of ARKit (jawOpen …), Oculus (viseme_aa …) or VRM "
-            f"(A, I, U, E, O); rename them, or omit --own-shapes"
+            f"(A, I, U, E, O); rename them"
         )
     # Lids and brows under ARKit's names belong to any avatar's face; its mouth is one set's.
     upper = {name: binds for name, binds in arkit.items() if name.startswith(("eye", "brow"))}

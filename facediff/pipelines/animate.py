@@ -88,10 +88,6 @@ def check_options(options: AnimationOptions) -> None:
             raise OptionError(name, "no such file", file)
     if options.style is None:
         refuse_idle("has no effect without {style}", style_template=options.style_template is not None)
-    if options.own_shapes:
-        from facediff.export.glb_own_shapes import own_shapes
-
-        own_shapes(Path(str(options.target_mesh)))
 
 
 def expressivity_of(options: AnimationOptions) -> dict[str, float]:
@@ -287,10 +283,8 @@ class AnimationPipeline(ABC):
         # A surface alone would lose materials, skins and targets of a .glb, coordinates and pictures.
         target = Path(self.options.target_mesh or "")
         is_dressed = holds_glb(output) and export.output_unit is None and self._target_has_materials
-        into = target if is_dressed or hands_on_textures(target, output) else None
         own_shapes = self.options.own_shapes
-        if own_shapes and not is_dressed:
-            raise OptionError("own_shapes", "writes the avatar itself; choose a .glb in metres", output)
+        into = target if own_shapes or is_dressed or hands_on_textures(target, output) else None
         with self.animations(recording, output, seed=seed) as animations:
             z_up = self.retarget is not None and self.retarget.z_up
             written = write_animations(output, animations, export, into=into, own_shapes=own_shapes, z_up=z_up)

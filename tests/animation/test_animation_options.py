@@ -20,7 +20,7 @@ from facediff.animation.options import (
 
 # The model is there already, where an animation is asked for.
 OF_THE_MODEL = {"checkpoint", "quiet", "device", "commercial_only", "threads"}
-OF_A_FILE = {"own_shapes"}  # `Animation.drive` writes it
+OF_A_FILE = {"carry", "own_shapes"}  # `Animation.drive` writes it
 
 
 def plain(hint: object) -> object:

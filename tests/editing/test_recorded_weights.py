@@ -109,7 +109,9 @@ def test_a_glb_of_vertices_that_are_not_the_sum_of_the_weights_is_exact(tmp_path
     assert "jawOpen" not in Reader(tmp_path / "a.glb").gltf.meshes[0].extras["targetNames"]
 
 
-def test_the_command_writes_the_weights_of_a_take_and_plays_it_on_an_avatars_own_rig(tmp_path: Path) -> None:
+def test_the_command_writes_the_weights_of_a_take_and_plays_it_on_an_avatars_own_rig(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     clip, take = take_of(tmp_path / "take.csv"), str(tmp_path / "take.csv")
     assert main(["export", take, "-o", str(tmp_path / "beat.json")]) == 0
     assert main(["export", take, "-o", str(tmp_path / "again.csv")]) == 0
@@ -123,7 +125,7 @@ def test_the_command_writes_the_weights_of_a_take_and_plays_it_on_an_avatars_own
     avatar = Animation("avatar", rest[None].astype(np.float32), rest.astype(np.float32), 30.0, faces=faces)
     deltas = np.stack([shapes[name] - rest for name in layout("arkit").channels])
     avatar.made_of(layout("arkit"), np.zeros((1, 52), np.float32), deltas).save(tmp_path / "avatar.glb")
-    words = ["retarget", take, "--target-mesh", str(tmp_path / "avatar.glb"), "--own-shapes"]
+    words = ["retarget", take, "--target-mesh", str(tmp_path / "avatar.glb")]
     assert main([*words, "-o", str(tmp_path / "speaks.glb")]) == 0
     read = Reader(tmp_path / "speaks.glb")
     targets = read.gltf.meshes[0].extras["targetNames"]
@@ -131,3 +133,6 @@ def test_the_command_writes_the_weights_of_a_take_and_plays_it_on_an_avatars_own
     played = read.values(motion.samplers[motion.channels[0].sampler].output).reshape(30, -1)
     wanted = clip.values[:, [clip.space.index(name) for name in targets]]
     np.testing.assert_allclose(played, np.clip(wanted, 0, 1), atol=1e-6)
+    capsys.readouterr()
+    assert main([*words, "--part", "Head", "-o", str(tmp_path / "x.glb")]) == 2
+    assert "--part: has no effect without --carry" in capsys.readouterr().err

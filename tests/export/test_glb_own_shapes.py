@@ -353,7 +353,7 @@ def test_a_figures_head_turns_by_its_bone_where_shapes_are_solved_for(
     for shown in (talk, move_head(talk, turns, 0.02 * turns)):
         write_archive(tmp_path / "talk.npz", shown)
         words = ["--target-mesh", str(tmp_path / "avatar.glb"), "--correspondence", str(tmp_path / "map.npz")]
-        words += ["--own-shapes", "--accept-poor", "-o", str(tmp_path / "out.glb")]
+        words += ["--accept-poor", "-o", str(tmp_path / "out.glb")]
         assert main(["retarget", str(tmp_path / "talk.npz"), *words]) == 0
         rows.append((moving := tracks(opened(tmp_path / "out.glb")))["Head", "weights"])
     assert ("HeadJoint", "rotation") in moving
