@@ -54,7 +54,7 @@ from facediff.synthetic.sentences import TEST
 from facediff.synthetic.voices import installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic
-from facediff.utils.tables import print_table
+from facediff.utils.text_tables import print_table
 
 Array = npt.NDArray[np.floating]
 Change = Callable[[Array], Array]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation.files import read_archive
+from facediff.animation.archives import read_archive
 from facediff.animation.style_files import open_style, with_layout
 from facediff.errors import FaceDiffError, OptionError
 from facediff.spaces import Space

@@ -12,7 +12,7 @@ from facediff.benchmark.outline import ReportOutline
 from facediff.benchmark.plan import COSTS, MEAN_SUFFIX
 from facediff.benchmark.published import PublishedScores, shown_tables
 from facediff.benchmark.results import Result
-from facediff.benchmark.statistics import Difference, RowScores, compared, follows_speech, marked
+from facediff.benchmark.significance import Difference, RowScores, compared, follows_speech, marked
 from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils import ranges

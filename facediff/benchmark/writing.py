@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from facediff.benchmark.plots import plots_of
-from facediff.benchmark.statistics import Difference, RowScores
+from facediff.benchmark.significance import Difference, RowScores
 from facediff.benchmark.tables import BenchmarkReport, Table, TableRow
 from facediff.errors import FaceDiffError
 from facediff.reporting.documents import (

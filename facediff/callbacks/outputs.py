@@ -22,7 +22,7 @@ from facediff.utils.files import atomic
 from facediff.utils.hints import checks_arguments
 from facediff.utils.plain_files import write_json, write_rows
 from facediff.utils.ranges import Range
-from facediff.utils.tables import format_table
+from facediff.utils.text_tables import format_table
 
 METHOD_NAMES = {name: label.format(model="model") for name, label in METHODS.items()}
 

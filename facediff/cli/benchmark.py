@@ -158,7 +158,7 @@ def announce(
     workers: int | None,
 ) -> None:
     """List the cells that will run, with times."""
-    from facediff.utils.tables import format_table
+    from facediff.utils.text_tables import format_table
 
     at_a_time = f"{workers} at a time" if workers else "one on each worker at a time"
     tell(f"{plan.title}: {counted(len(cells), 'cell')}, {len(cells) - len(left)} done, {len(left)} to run, {at_a_time}")

@@ -136,7 +136,7 @@ def evaluate(
     methods = named_folders([predictions, *(method or [])])
     from facediff.evaluation import evaluate as score
     from facediff.evaluation.evaluator import find_protocols
-    from facediff.evaluation.files import find_truths
+    from facediff.evaluation.file_pairs import find_truths
     from facediff.evaluation.parameters import ParameterFiles, holds_parameters
 
     protocols = find_protocols(scores.protocol or ["paper"], files.topology)
@@ -187,8 +187,8 @@ def faces_of(
     from facediff.data.corpus import read_templates
     from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN, read_region
     from facediff.evaluation.evaluator import find_protocols, needs_upper_face
-    from facediff.evaluation.files import count_vertices, read_pairs
-    from facediff.mesh.files import read_mesh
+    from facediff.evaluation.file_pairs import count_vertices, read_pairs
+    from facediff.mesh.mesh_files import read_mesh
     from facediff.metrics import EyelidPairs
 
     templates, folder = files.templates, scores.regions

@@ -152,7 +152,7 @@ def corpus_of_checkpoint(
 def text(scores: GenerationScores) -> str:
     """The metrics as a table, one row each, under a line that names corpus, clips and sampler."""
     from facediff.models.generation_metrics import GENERATION_METRICS
-    from facediff.utils.tables import format_table
+    from facediff.utils.text_tables import format_table
 
     kind = "SYNTHETIC corpus" if scores.synthetic else "corpus"
     counts = ", ".join(f"{count} of {split}" for split, count in scores.clips.items())

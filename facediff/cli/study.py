@@ -168,9 +168,9 @@ def report(
         return print_plan(folders, plan, power, level, per_rater, correlation, comparisons)
     if not folders:
         raise FaceDiffError("studies: missing; give the folder of a study, or --plan D")
+    from facediff.study.analysis import analyse_folder
     from facediff.study.definition import read_study
-    from facediff.study.report import analyse_folder
-    from facediff.study.tables import json_report, text, write_report
+    from facediff.study.report_files import json_report, text, write_report
     from facediff.utils.files import atomic
 
     options = {"interval": interval, "level": level, "resamples": bootstrap, "seed": seed}
@@ -205,7 +205,7 @@ def print_plan(
 ) -> int:
     """Print how many raters are needed."""
     from facediff.study import raters_needed, read_study
-    from facediff.study.report import design_of
+    from facediff.study.analysis import design_of
 
     for name, folder in folders.items() or {"": None}.items():
         defaults = (1, 1) if folder is None else design_of(read_study(folder))

@@ -26,9 +26,9 @@ from facediff.data.recordings import RecordingFolder
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
 from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage, WeightFile
 from facediff.errors import FaceDiffError, damaged
-from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
+from facediff.mesh.mesh_files import read_mesh
 from facediff.metrics import Region
 from facediff.spaces import VERTICES, Space
 from facediff.speech.audio import samples_for

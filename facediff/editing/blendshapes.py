@@ -17,7 +17,7 @@ from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.mesh.mesh import triangle_areas
 from facediff.spaces.arkit import ARKIT, absent_from, beyond_arkit, mirror_pairs
 from facediff.spaces.files.clips import ParameterClip
-from facediff.spaces.files.tables import gaze, live_link_header, live_link_rows
+from facediff.spaces.files.csv_files import gaze, live_link_header, live_link_rows
 from facediff.spaces.layouts import layout
 from facediff.spaces.rigs import LinearRig
 from facediff.spaces.rotations import convert
@@ -91,7 +91,7 @@ class Weights:
         metadata: the animation's, and how the weights were solved for.
         head: (T, 3) rotation of the head that the weights leave out, axis-angle in radians; None if it does not move.
         eyes: (T, 6) yaw, pitch and roll of the left and the right eye, radians as
-            :func:`facediff.spaces.files.tables.gaze` has them; None if only weights say where the eyes look.
+            :func:`facediff.spaces.files.csv_files.gaze` has them; None if only weights say where the eyes look.
     """
 
     names: tuple[str, ...]

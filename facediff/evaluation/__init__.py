@@ -1,7 +1,7 @@
 """Scoring files of predictions against files of truth, from any program."""
 
 from facediff.evaluation.evaluator import evaluate
-from facediff.evaluation.files import DEFAULT_PATTERNS, TRUTH_PATTERN, Missing, read_region
+from facediff.evaluation.file_pairs import DEFAULT_PATTERNS, TRUTH_PATTERN, Missing, read_region
 from facediff.evaluation.report import Comparison, EvaluationReport, MethodResult, Score, SequenceScores, text
 from facediff.reporting.statistics import Interval
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from facediff.data.conversations import CONVERSATION, channel_regions, conversation_file
 from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, read_manifest
 from facediff.errors import FaceDiffError
-from facediff.evaluation.files import (
+from facediff.evaluation.file_pairs import (
     DEFAULT_PATTERNS,
     OWN,
     TRUTH_PATTERN,
@@ -68,7 +68,7 @@ class EvaluationOptions:
         file_unit: unit of the vertices; as the rig or the corpus's ``manifest.json`` says if None.
         renders: render metrics by name with options; see :mod:`facediff.evaluation.renders`.
         faces: (F, 3) triangles, of the rendered mesh; the rig's if None.
-        patterns: how predictions may be named; see :class:`facediff.evaluation.files.NamePattern`.
+        patterns: how predictions may be named; see :class:`facediff.evaluation.file_pairs.NamePattern`.
         truth_pattern: how truths are named.
         identity: which predictions of a clip are scored where several were conditioned on different identities:
             ``own`` takes the one conditioned on the clip's own speaker (or whose name has no condition), ``all`` the

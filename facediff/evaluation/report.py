@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from facediff.errors import FaceDiffError, printable
-from facediff.evaluation.files import Missing, Pair, errors_of
+from facediff.evaluation.file_pairs import Missing, Pair, errors_of
 from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
 from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, Interval
 from facediff.utils.provenance import Provenance, read_provenance
-from facediff.utils.tables import format_table
+from facediff.utils.text_tables import format_table
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from facediff.errors import FaceDiffError
-from facediff.evaluation.files import Pair, errors_of
+from facediff.evaluation.file_pairs import Pair, errors_of
 from facediff.metrics import (
     FaceDynamicsDeviation,
     Protocol,

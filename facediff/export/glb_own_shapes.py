@@ -27,7 +27,7 @@ from facediff.mesh.glb import POSITIONS, Glb, open_glb, whole_number
 from facediff.mesh.glb_scene import node_matrix, placed_nodes
 from facediff.mesh.glb_shapes import target_names
 from facediff.spaces.arkit import ARKIT, arkit_name, plain
-from facediff.spaces.files.tables import gaze
+from facediff.spaces.files.csv_files import gaze
 from facediff.spaces.rotations import convert, matrices
 from facediff.spaces.visemes import OCULUS, VRM
 from facediff.utils.files import holds_glb

@@ -10,9 +10,9 @@ from facediff.mesh.alignment import (
     robust_align,
     stable_vertices,
 )
-from facediff.mesh.files import read_mesh
 from facediff.mesh.hierarchy import MeshHierarchy, MeshLevel, mesh_hierarchy
 from facediff.mesh.mesh import Mesh
+from facediff.mesh.mesh_files import read_mesh
 
 __all__ = [
     "Mesh",

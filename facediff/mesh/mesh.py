@@ -1,4 +1,4 @@
-"""Triangle meshes: areas, and nearest points of triangles; :mod:`facediff.mesh.files` reads them."""
+"""Triangle meshes: areas, and nearest points of triangles; :mod:`facediff.mesh.mesh_files` reads them."""
 
 from __future__ import annotations
 

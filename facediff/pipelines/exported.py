@@ -7,7 +7,7 @@ from copy import copy
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
-from facediff.animation.files import facts_of
+from facediff.animation.archives import facts_of
 from facediff.animation.options import AnimationOptions
 from facediff.errors import OptionError, refuse_idle
 from facediff.pipelines.animate import AnimationPipeline, expressivity_of

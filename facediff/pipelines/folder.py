@@ -27,7 +27,7 @@ from facediff.utils.files import check_folder_writable, check_writable, locked, 
 from facediff.utils.hub import is_exported, may_have_weights, model_files
 from facediff.utils.jobs import PerWorker, is_cluster
 from facediff.utils.output_paths import refuse_overwriting
-from facediff.utils.tables import print_table
+from facediff.utils.text_tables import print_table
 
 LOCK = ".facediff-batch.lock"
 """Next to the outputs while a batch is running."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, cast
 
 from facediff.animation import Animation
-from facediff.animation.files import AnimationFacts, complete, facts_of, read_animation
+from facediff.animation.archives import AnimationFacts, complete, facts_of, read_animation
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
 from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.utils import ranges

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from facediff.errors import printable
 from facediff.utils.files import atomic
-from facediff.utils.tables import format_table
+from facediff.utils.text_tables import format_table
 
 NONE = "–"
 BEST, SECOND = "best", "second"

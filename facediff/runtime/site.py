@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from facediff.animation import Animation
-from facediff.animation.files import FORMAT as ARCHIVE
+from facediff.animation.archives import FORMAT as ARCHIVE
 from facediff.errors import FaceDiffError
 from facediff.export.format import outward
 from facediff.export.viewer.packing import Blobs, millimetres

@@ -11,27 +11,27 @@ from typing import TYPE_CHECKING
 from facediff.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from facediff.study.analysis import StudyReport as StudyReport
+    from facediff.study.analysis import analyse as analyse
+    from facediff.study.analysis import analyse_folder as analyse_folder
     from facediff.study.definition import Study as Study
     from facediff.study.definition import read_study as read_study
     from facediff.study.making import StudyPlan as StudyPlan
     from facediff.study.making import plan_study as plan_study
     from facediff.study.options import StudyOptions as StudyOptions
-    from facediff.study.report import StudyReport as StudyReport
-    from facediff.study.report import analyse as analyse
-    from facediff.study.report import analyse_folder as analyse_folder
+    from facediff.study.rating_statistics import raters_needed as raters_needed
     from facediff.study.server import serve as serve
     from facediff.study.simulation import simulate as simulate
-    from facediff.study.statistics import raters_needed as raters_needed
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "analysis": "StudyReport analyse analyse_folder",
         "definition": "Study read_study",
         "making": "StudyPlan plan_study",
         "options": "StudyOptions",
-        "report": "StudyReport analyse analyse_folder",
         "server": "serve",
         "simulation": "simulate",
-        "statistics": "raters_needed",
+        "rating_statistics": "raters_needed",
     },
 )

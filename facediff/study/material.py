@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
-from facediff.animation.files import AnimationFacts, read_animation
+from facediff.animation.archives import AnimationFacts, read_animation
 from facediff.data.corpus import MOTION_FOLDERS
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.gather import gather
 from facediff.evaluation.figures.material import few
-from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, NamePattern
+from facediff.evaluation.file_pairs import DEFAULT_PATTERNS, OWN, NamePattern
 from facediff.mesh import read_mesh
 from facediff.speech.audio import CONTAINERS, SUFFIXES, read_sound_to_play
 from facediff.study.design import STILL, TRUTH

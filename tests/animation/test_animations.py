@@ -12,7 +12,7 @@ import pytest
 
 from facediff.animation import Animation, metres_per_unit, read_animation, read_archive, write_archive
 from facediff.animation.animation import MotionMap, allocate_like, stretches_of
-from facediff.animation.files import AnimationFacts
+from facediff.animation.archives import AnimationFacts
 from facediff.errors import FaceDiffError
 from facediff.utils.arrays import open_array
 

@@ -14,7 +14,7 @@ from onnx import TensorProto, helper
 from facediff.cli.app import run
 from facediff.errors import FaceDiffError
 from facediff.evaluation.renders import SyncScores, framing, mel_spectrogram, read_render_metrics
-from facediff.mesh.files import read_mesh
+from facediff.mesh.mesh_files import read_mesh
 from facediff.render.rasteriser import Renderer
 from facediff.speech.cepstra import mel_filters
 

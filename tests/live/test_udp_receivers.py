@@ -25,7 +25,7 @@ from facediff.live.receivers.sending import Outbox
 from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files.clips import ParameterClip
-from facediff.spaces.files.tables import live_link_header, live_link_rows
+from facediff.spaces.files.csv_files import live_link_header, live_link_rows
 from facediff.spaces.layouts import layout
 from facediff.spaces.visemes import visemes
 from tests.fakes.waiting import PATIENCE

@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch import Trainer
 
 from facediff.animation import Animation
-from facediff.animation.files import read_animation
+from facediff.animation.archives import read_animation
 from facediff.animation.options import AnimationOptions, ExportOptions
 from facediff.cli.app import main
 from facediff.data import Reference

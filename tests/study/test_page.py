@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from facediff.study import read_study
+from facediff.study.analysis import analyse_folder
 from facediff.study.answers import check_rater
 from facediff.study.definition import DATABASE, PAGE_FOLDER
-from facediff.study.report import analyse_folder
 from facediff.study.store import AnswerStore
 from tests.fakes.chromium import Chromium, Page
 from tests.study.conftest import Serve

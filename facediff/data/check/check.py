@@ -11,6 +11,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from facediff.data.check.clip import LENGTHS, ClipFiles, ClipInfo, Rules, examine, is_about
+from facediff.data.check.findings import FEW, CheckReport, Findings, few
 from facediff.data.check.layouts import (
     MANIFEST,
     SPLITS,
@@ -25,7 +26,6 @@ from facediff.data.check.layouts import (
 )
 from facediff.data.check.packed import check_packed, examine_packed
 from facediff.data.check.recordings import check_recordings, parametric_module, refuse_layout
-from facediff.data.check.report import FEW, CheckReport, Findings, few
 from facediff.data.check.shared import (
     check_account,
     check_areas,

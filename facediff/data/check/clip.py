@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.check.report import Findings, relative
+from facediff.data.check.findings import Findings, relative
 from facediff.data.storage import open_motion, rig_path
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import CUT, cut_short, open_sound

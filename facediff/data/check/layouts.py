@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast, get_args, get_origin, get_type_hints
 
-from facediff.data.check.report import Findings, few
+from facediff.data.check.findings import Findings, few
 from facediff.data.manifest import load_manifest
 from facediff.data.storage import WEIGHTS_FOLDER, rig_path
 from facediff.errors import FaceDiffError, choices, damaged, lacking, number

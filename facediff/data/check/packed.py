@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from facediff.data.check.clip import Array, ClipFiles, ClipInfo, Rules, check_vertices, compare_lengths
-from facediff.data.check.report import Findings
+from facediff.data.check.findings import Findings
 
 if TYPE_CHECKING:
     from facediff.data.packed.reader import PackedCorpus

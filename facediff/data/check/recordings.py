@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from facediff import registry
-from facediff.data.check.report import CheckReport, few, relative
+from facediff.data.check.findings import CheckReport, few, relative
 from facediff.errors import FaceDiffError
 from facediff.spaces.layouts import LAYOUTS
 from facediff.spaces.operations import FLOOR

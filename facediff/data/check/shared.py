@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.check.clip import Array
+from facediff.data.check.findings import Findings, few, relative
 from facediff.data.check.layouts import MANIFEST, STATE, CorpusView
-from facediff.data.check.report import Findings, few, relative
 from facediff.errors import counted, number
 from facediff.mesh.mesh import surface_area
 from facediff.utils.checksums import sha256

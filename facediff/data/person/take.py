@@ -20,7 +20,7 @@ from facediff.data.person.importer import (
 from facediff.data.preparation import write_speech
 from facediff.errors import FaceDiffError, counted
 from facediff.spaces.files import ParameterClip, even, read_parameters
-from facediff.spaces.files.tables import write_live_link
+from facediff.spaces.files.csv_files import write_live_link
 from facediff.speech.audio import SAMPLE_RATE, fit_length
 from facediff.utils import ranges
 from facediff.utils.cross_correlation import correlations, lagged_correlation, peak

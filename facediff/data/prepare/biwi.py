@@ -33,8 +33,8 @@ from facediff.data.preparation import (
     write_templates,
 )
 from facediff.errors import FaceDiffError
-from facediff.mesh.files import read_mesh
 from facediff.mesh.mesh import surface_area
+from facediff.mesh.mesh_files import read_mesh
 
 SUBJECTS = [*(f"F{i}" for i in range(1, 9)), *(f"M{i}" for i in range(1, 7))]
 SEEN = ("F2", "F3", "F4", "M3", "M4", "M5")

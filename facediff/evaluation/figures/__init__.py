@@ -24,7 +24,7 @@ from facediff.evaluation.figures.training import (
     read_curves,
     smooth,
 )
-from facediff.evaluation.files import read_pairs
+from facediff.evaluation.file_pairs import read_pairs
 from facediff.speech.phonemes import TimedPhoneme, read_phonemes
 
 __all__ = [

@@ -17,9 +17,9 @@ from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
 from facediff.data.puppet import cache_root, made_root
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import FigureData, find_clips
-from facediff.evaluation.files import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
-from facediff.mesh.files import SUFFIXES, read_mesh
+from facediff.evaluation.file_pairs import DEFAULT_PATTERNS, OWN, TRUTH_PATTERN, count_vertices, find_truths
 from facediff.mesh.mesh import Mesh
+from facediff.mesh.mesh_files import SUFFIXES, read_mesh
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import TimedPhoneme, phonemes_file, read_phonemes
 from facediff.utils import ranges

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from facediff.data.corpus import ALL
 from facediff.errors import FaceDiffError, check_known, choices
-from facediff.evaluation.files import (
+from facediff.evaluation.file_pairs import (
     DEFAULT_PATTERNS,
     OWN,
     TRUTH_PATTERN,

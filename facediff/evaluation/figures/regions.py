@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.check.findings import Findings
 from facediff.data.check.layouts import MANIFEST, CorpusView, identify, list_folder, manifest_in
-from facediff.data.check.report import Findings
 from facediff.data.corpus import MOTION_FOLDERS, Corpus, find_region
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import Mesh

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.animation.files import FORMAT as ARCHIVE
+from facediff.animation.archives import FORMAT as ARCHIVE
 from facediff.animation.options import ExportOptions
 from facediff.editing import direction
 from facediff.editing.acting import speech_16k

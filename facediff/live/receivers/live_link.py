@@ -30,7 +30,7 @@ from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
 from facediff.spaces.arkit import ARKIT, ROTATIONS, left_first
-from facediff.spaces.files.tables import gaze, mirrored
+from facediff.spaces.files.csv_files import gaze, mirrored
 
 VERSION = 6
 LONGEST_NAME = 64

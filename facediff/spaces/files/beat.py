@@ -11,7 +11,7 @@ import numpy as np
 from facediff.errors import FaceDiffError, damaged
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files.clips import ParameterClip, checked
-from facediff.spaces.files.tables import rate_of
+from facediff.spaces.files.csv_files import rate_of
 from facediff.spaces.layouts import LAYOUTS, layout
 from facediff.spaces.space import Space
 from facediff.utils.hints import check_number

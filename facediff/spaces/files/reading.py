@@ -8,7 +8,7 @@ from facediff.errors import check_known, refuse_idle
 from facediff.spaces.files.arrays import read_array, write_array
 from facediff.spaces.files.beat import read_beat, write_beat
 from facediff.spaces.files.clips import ParameterClip
-from facediff.spaces.files.tables import (
+from facediff.spaces.files.csv_files import (
     COUNT,
     REMEDY,
     read_audio2face,

@@ -15,8 +15,8 @@ from facediff.data.prepare import mead3d
 from facediff.data.prepare.mead3d import find_sounds
 from facediff.data.reconstructions import read_parameters
 from facediff.errors import FaceDiffError
-from facediff.mesh.files import read_mesh
 from facediff.mesh.flame import Flame
+from facediff.mesh.mesh_files import read_mesh
 from facediff.speech.audio import read_speech
 from facediff.utils.pickles import load_pickle
 from tests.fakes.flame import VERTICES, flame_arrays, write_flame

@@ -15,7 +15,7 @@ from facediff.cli.track import with_tracked_styles
 from facediff.data import People
 from facediff.data.corpus import read_clip_table, read_templates
 from facediff.data.track.topology import LIP_PAIRS
-from facediff.mesh.files import read_mesh
+from facediff.mesh.mesh_files import read_mesh
 from tests.fakes.people import Look, talking, use_coded_faces, write_coded_video, write_people
 
 

@@ -15,7 +15,7 @@ from facediff.editing.blendshapes import Weights, live_link_values, write_live_l
 from facediff.errors import FaceDiffError
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import read_parameters
-from facediff.spaces.files.tables import timecode
+from facediff.spaces.files.csv_files import timecode
 
 
 @pytest.fixture

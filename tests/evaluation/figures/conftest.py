@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from facediff.data.corpus import read_templates
 from facediff.evaluation.figures import FigureData, find_clips
-from facediff.mesh.files import read_mesh
+from facediff.mesh.mesh_files import read_mesh
 from tests.fakes.tiny import RATE, VERTICES
 
 CLIPS = ("A_e06", "A_e07", "B_e06")

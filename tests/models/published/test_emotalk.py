@@ -16,7 +16,7 @@ import torch
 from scipy.signal import savgol_filter
 from torch import Tensor
 
-from facediff.animation.files import read_animation
+from facediff.animation.archives import read_animation
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import EmoTalk, import_checkpoint

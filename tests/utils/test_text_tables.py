@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from facediff.utils.tables import format_table, print_table
+from facediff.utils.text_tables import format_table, print_table
 
 ROOT = Path(__file__).parents[2]
 

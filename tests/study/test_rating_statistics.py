@@ -11,7 +11,13 @@ from scipy.optimize import minimize
 from scipy.stats import binom, binomtest
 
 from facediff.reporting.statistics import binomial_interval, binomial_p, share_between_raters, wilson_interval
-from facediff.study.statistics import alpha_interval, bradley_terry, is_connected, krippendorff_alpha, raters_needed
+from facediff.study.rating_statistics import (
+    alpha_interval,
+    bradley_terry,
+    is_connected,
+    krippendorff_alpha,
+    raters_needed,
+)
 
 COUNTS = [(0, 7), (7, 7), (3, 7), (89, 120), (52, 120), (1, 1000)]
 

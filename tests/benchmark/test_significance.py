@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from facediff.benchmark.statistics import RowScores, both_chances, compared, difference, marked, welch
+from facediff.benchmark.significance import RowScores, both_chances, compared, difference, marked, welch
 from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, holm, sign_flip
 

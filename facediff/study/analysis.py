@@ -24,7 +24,7 @@ from facediff.reporting.statistics import (
 from facediff.study.answers import Rater, merge, read_answers
 from facediff.study.definition import DATABASE, LEFT, RIGHT, Study, Trial, read_study
 from facediff.study.design import TRUTH
-from facediff.study.statistics import alpha_interval, bradley_terry, is_connected, krippendorff_alpha
+from facediff.study.rating_statistics import alpha_interval, bradley_terry, is_connected, krippendorff_alpha
 from facediff.study.store import AnswerStore
 from facediff.utils import ranges
 

@@ -15,10 +15,10 @@ import pytest
 from facediff.cli.app import main
 from facediff.reporting.documents import markdown
 from facediff.study import analyse, simulate
+from facediff.study.analysis import check_rater
 from facediff.study.answers import Rater
 from facediff.study.definition import Rule, Study
-from facediff.study.report import check_rater
-from facediff.study.tables import blocks, main_table, write_report
+from facediff.study.report_files import blocks, main_table, write_report
 from facediff.study.texts import Questionnaire
 from tests.fakes.study import SCORES, small_study, write_study
 

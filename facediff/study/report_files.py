@@ -30,8 +30,8 @@ from facediff.reporting.documents import (
     write_texts,
 )
 from facediff.reporting.drawing import GREY, LONGEST_LABEL, has_matplotlib, plain, plot_svg
+from facediff.study.analysis import Preference, StudyReport, answers_of
 from facediff.study.definition import SAME
-from facediff.study.report import Preference, StudyReport, answers_of
 from facediff.utils.plain_files import json_text, write_rows
 
 if TYPE_CHECKING:

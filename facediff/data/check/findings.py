@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from facediff.errors import FaceDiffError, MissingExtraError, counted, number, printable
-from facediff.utils.tables import format_table
+from facediff.utils.text_tables import format_table
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")

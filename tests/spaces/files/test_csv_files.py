@@ -12,7 +12,7 @@ from facediff.errors import FaceDiffError
 from facediff.spaces import layout
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.files import ParameterClip, even, read_parameters, write_parameters
-from facediff.spaces.files.tables import seconds_of, timecode
+from facediff.spaces.files.csv_files import seconds_of, timecode
 from facediff.spaces.rotations import convert, matrices
 
 # The first rows of a real take have such steps: two sixtieths less a thousandth now and then.
