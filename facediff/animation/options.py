@@ -346,10 +346,12 @@ class AnimationOptions(
     Attributes:
         checkpoint: the trained model
         quiet: whether progress bars are hidden
+        alive: whether the built-in face gets a lively style, acting, sway and glances, as far as they were not chosen
     """
 
     checkpoint: FilePath
     quiet: bool = True
+    alive: bool = False
 
     def words(self) -> list[str]:
         """The options that change a take, as on the command line, but for keys over time and what metadata name.
@@ -373,7 +375,7 @@ class AnimationOptions(
 
 NAMED_ELSEWHERE = (
     *("checkpoint", "identity", "style", "seed", "expressivity", "guidance", "direction"),
-    *("samples", "quiet", "device", "commercial_only", "own_shapes"),
+    *("samples", "quiet", "device", "commercial_only", "own_shapes", "alive"),
 )
 """Options of a take that its metadata name by themselves, that its page asks for, or that change nothing in it."""
 

@@ -22,7 +22,7 @@ from facediff.cli.parsing import changed
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils import ranges
-from facediff.utils.files import example_recording
+from facediff.utils.files import example_recording, holds_glb
 from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.option import Option
 
@@ -54,6 +54,7 @@ def animate(
     output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file or folder", dash=True)],
     stream: bool = False,
     rate: Annotated[ranges.SampleRate, Option(metavar="HZ", needs="stream")] = 16_000,
+    still: bool = False,
     quiet: bool = False,
     yes: bool = False,
     generation: GenerationOptions,
@@ -83,6 +84,8 @@ def animate(
         output: file to write; its suffix chooses the format (see `facediff export --help`); a folder for a batch
         stream: read PCM (16 bit, mono, little endian) from standard input as it comes
         rate: sample rate of that PCM
+        still: the model's motion alone in videos, pages and avatars, where the built-in face else has a lively style
+            and acts, sways and glances (--style, --acting, --sway, --gaze)
         quiet: no progress bars
         yes: start without a question, however much time or memory it takes
         generation: whose face, in which style, how.
@@ -115,23 +118,27 @@ def animate(
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     checkpoint = model_or_bundled(checkpoint)
     check_animating_source(checkpoint)
-    from facediff.export import check_used
+    from facediff.export import FORMATS, check_used
 
-    check_used(batch.suffix if is_batch else ".npy" if stream else output.suffix, files.changed())
+    file = Path(f"a{batch.suffix}") if is_batch else Path("a.npy") if stream else output
+    check_used(file.suffix, files.changed())
+    is_seen = file.suffix == ".html" or (file.suffix in FORMATS and "view" in FORMATS[file.suffix].uses)
+    is_seen = is_seen or (target.target_mesh is not None and holds_glb(file))
+    refuse_idle(
+        "is for videos, pages and avatars: other files have the model's motion alone", still=still and not is_seen
+    )
     files = replace(files, quiet=quiet)
     if isinstance(generation.style, str):
         from facediff.cli.track import with_tracked_styles
 
         words = with_tracked_styles(generation.style, checkpoint)
         generation = replace(generation, style=words)
-    if target.target_mesh is not None and not target.carry and not stream:
+    if target.target_mesh is not None and not target.carry:
         from facediff.export.glb_own_shapes import shapes_to_drive
 
-        avatar = shapes_to_drive(Path(target.target_mesh), Path(f"a{batch.suffix}") if is_batch else output)
-        target = replace(target, own_shapes=avatar is not None)
-    options = AnimationOptions.of(
-        generation, windows, recording, controls, target, device, licence, checkpoint=checkpoint, quiet=quiet
-    )
+        target = replace(target, own_shapes=shapes_to_drive(Path(target.target_mesh), file) is not None)
+    groups = (generation, windows, recording, controls, target, device, licence)
+    options = AnimationOptions.of(*groups, checkpoint=checkpoint, quiet=quiet, alive=is_seen and not still)
     if stream:
         from facediff.pipelines.stream import animate_stream
 

@@ -21,7 +21,8 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.animation.options import AnimationOptions, ExportOptions, Scales, scales_text
-from facediff.editing.controls import check_controls, is_procedural, keys_of
+from facediff.editing.blendshapes import is_built_in_face
+from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
 from facediff.errors import OptionError, refuse_idle
 from facediff.pipelines.stages import (
     Act,
@@ -44,6 +45,7 @@ from facediff.utils import SAMPLE_RATE, hints, ranges
 from facediff.utils.files import holds_glb, scratch_folder, valid_text
 from facediff.utils.hub import is_audio2face
 from facediff.utils.progress import track
+from facediff.utils.ranges import USUAL_GAZE, USUAL_SWAY
 from facediff.version import __version__
 
 if TYPE_CHECKING:
@@ -88,6 +90,16 @@ def check_options(options: AnimationOptions) -> None:
             raise OptionError(name, "no such file", file)
     if options.style is None:
         refuse_idle("has no effect without {style}", style_template=options.style_template is not None)
+
+
+def enlivened(options: AnimationOptions) -> AnimationOptions:
+    """The options with acting, sway and glances where the user chose none, by an option or by keys over time."""
+    if keys_file(options.direction) is not None:
+        return options
+    keys = keys_of(options.direction)
+    usual = {"acting": "prosody", "sway": USUAL_SWAY, "gaze": USUAL_GAZE}
+    free = [name for name in usual if getattr(options, name) is None and (keys is None or not keys.under(name))]
+    return replace(options, **{name: usual[name] for name in free})
 
 
 def expressivity_of(options: AnimationOptions) -> dict[str, float]:
@@ -139,6 +151,8 @@ class AnimationPipeline(ABC):
         rest_weights: Callable[[], Array],
         decoder: ChannelDecoder | None = None,
     ) -> None:
+        if options.alive and decoder is None and is_built_in_face(len(face["template"]), face.get("faces")):
+            options = enlivened(options)
         self.options, self.facts, self.windows = options, face, windows
         self.frame_rate: float = face["frame_rate"]
         self.windows.in_frames(self.frame_rate)
@@ -225,8 +239,6 @@ class AnimationPipeline(ABC):
         """Whether animations have weights of ARKit's shapes, or are of the built-in face, which has such shapes."""
         if self.decoder is not None and self.decoder.space.kind == "arkit":
             return True
-        from facediff.editing.blendshapes import is_built_in_face
-
         faces = self.facts.get("faces")
         return self.options.target_mesh is None and is_built_in_face(len(self.facts["template"]), faces)
 

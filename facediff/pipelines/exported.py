@@ -49,10 +49,11 @@ class ExportedPipeline(AnimationPipeline):
                 "an exported model has one for the whole face; give a single number",
                 options.expressivity,
             )
+        lively = f"{options.identity or about.known[0]}_lively"
         self._chosen: dict[str, Any] = {
             "identity": options.identity,
             "condition": options.condition,
-            "style": options.style,
+            "style": lively if options.alive and options.style is None and lively in about.styles else options.style,
             "expressivity": factors.get("all", 1.0),
         }
         stream = self.model.stream(seed=options.seed or 0, **self._chosen)

@@ -31,6 +31,29 @@ def test_a_recording_becomes_a_page_without_a_checkpoint_and_without_pytorch(tmp
     assert page.stat().st_size > 10_000
 
 
+def test_the_face_lives_in_what_is_looked_at_and_not_in_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said(name: str, *words: str) -> str:
+        assert main(["animate", str(SPEECH), "-o", str(tmp_path / name), *words]) == 0
+        return capsys.readouterr().out
+
+    unasked = said("alive.html")
+    assert "F1_lively" in unasked
+    assert all(control in unasked for control in ("gaze (4", "head sway (2", "acting (prosody"))
+    chosen = said("chosen.html", "--style", "F1_calm", "--sway", "5", "--direction", "happy")
+    assert all(choice in chosen for choice in ("F1_calm", "head sway (5", "gaze (4"))
+    still = said("still.html", "--still")
+    assert "style of F1," in still
+    assert "procedural" not in still
+    plain = said("plain.npz")
+    assert "procedural" not in plain
+    motion = facediff.load().animate(SPEECH)
+    assert np.array_equal(facediff.read(tmp_path / "plain.npz").vertices, motion.vertices)
+    assert main(["animate", str(SPEECH), "-o", str(tmp_path / "x.npz"), "--still"]) == 2
+    assert "is for videos, pages and avatars" in capsys.readouterr().err
+
+
 def test_its_name_is_taken_unless_a_file_is_called_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
