@@ -22,7 +22,7 @@ from facediff.cli.parsing import changed
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils import ranges
-from facediff.utils.files import example_recording, holds_glb
+from facediff.utils.files import example_recordings, holds_glb
 from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.option import Option
 
@@ -98,7 +98,7 @@ def animate(
         device: where the model computes.
         licence: which models are refused.
     """
-    speech = [example_recording()] if example else speech or []
+    speech = example_recordings()[:1] if example else speech or []
     if not speech:
         raise FaceDiffError("speech: missing; give a recording, a folder of them, - with --stream, or --example")
     streamed = [str(path) for path in speech] == ["-"]

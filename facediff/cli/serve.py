@@ -8,6 +8,7 @@ from typing import Annotated
 from facediff.cli.options import PageServer
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError
+from facediff.utils.files import example_recordings
 from facediff.utils.hub import is_audio2face, model_or_bundled
 from facediff.utils.option import Option
 from facediff.utils.server import require_server
@@ -34,7 +35,7 @@ def serve(
         model: folder of `facediff export-model` (default: the model that comes with facediff)
         output: folder to write in place of serving: page, model and ONNX Runtime, for any web server
         runtime: npm's package onnxruntime-web (.tgz) or a folder with its files, for machines without network
-        recordings: that the page offers to try the model with
+        recordings: that the page offers to try the model with (default: three that come with facediff)
         page: where it is served.
     """
     if output is None:
@@ -47,7 +48,7 @@ def serve(
     if is_audio2face(model):
         raise FaceDiffError(f"{model}: the page has no Audio2Face-3D; animate with it by `facediff animate` or `live`")
     read_folder(model)  # before anything is fetched
-    site = make_site(model, web_runtime(runtime, say=tell), recordings or ())
+    site = make_site(model, web_runtime(runtime, say=tell), recordings or example_recordings())
     if output is not None:
         size = write_site(site, output)
         tell(f"wrote {output}: {size / 1e6:.1f} MB; offer it by any web server, e.g. python -m http.server -d {output}")

@@ -42,11 +42,11 @@ def config_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "configs"
 
 
-def example_recording() -> Path:
-    """A synthetic recording to try the commands with; it lies in the installed package, or in a checkout's manual."""
+def example_recordings() -> list[Path]:
+    """Synthetic recordings to try the commands with; they lie in the installed package, or in a checkout's manual."""
     package = Path(__file__).parents[1]
-    inside = package / "examples" / "speech.wav"
-    return inside if inside.is_file() else package.parent / "docs" / "examples" / "speech.wav"
+    folder = package / "examples" if (package / "examples").is_dir() else package.parent / "docs" / "examples"
+    return [folder / f"{name}.wav" for name in ("speech", "question", "story")]
 
 
 # Atomic writing.

@@ -20,7 +20,7 @@ from facediff.animation.options import (
 
 # The model is there already, where an animation is asked for.
 OF_THE_MODEL = {"checkpoint", "quiet", "device", "commercial_only", "threads"}
-OF_A_FILE = {"carry", "own_shapes"}  # `Animation.drive` writes it
+OF_A_FILE = {"carry", "own_shapes", "alive"}  # `Animation.drive` and `Animation.save` write it
 
 
 def plain(hint: object) -> object:
@@ -43,7 +43,7 @@ def test_keywords_are_the_fields_with_their_types(options: type, keywords: type,
 def test_every_option_has_a_text_and_belongs_to_one_group() -> None:
     names = [field.name for group in GROUPS for field in dataclasses.fields(group)]
     assert len(names) == len(set(names))
-    assert {*option_texts(AnimationOptions)} == {*names, "checkpoint", "quiet"}
+    assert {*option_texts(AnimationOptions)} == {*names, "checkpoint", "quiet", "alive"}
 
 
 def test_groups_are_merged_and_know_what_was_changed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import sys
@@ -72,6 +73,15 @@ def test_every_file_is_offered_as_what_it_is_under_strict_headers(site: Site, se
         if name:
             assert "default-src 'none'" in headers["content-security-policy"]
     assert b"<b>face" not in ask(address)[2]
+
+
+def test_files_come_compressed_and_are_not_sent_again(site: Site, serve: Serve) -> None:
+    address = serve(site)
+    status, headers, content = ask(f"{address}/worker.js", **{"Accept-Encoding": "gzip"})
+    assert (status, headers["content-encoding"]) == (200, "gzip")
+    assert gzip.decompress(content) == site["worker.js"]
+    assert ask(f"{address}/worker.js", **{"If-None-Match": headers["etag"]})[0] == 304
+    assert ask(f"{address}/worker.js", **{"If-None-Match": '"another"'})[0] == 200
 
 
 def test_nothing_else_is_offered_and_no_other_page_may_ask(site: Site, serve: Serve) -> None:

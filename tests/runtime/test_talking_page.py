@@ -167,14 +167,23 @@ def test_page_plays_and_obeys_keys_and_buttons(page: Page, tmp_path: Path) -> No
 
 
 def test_an_example_of_the_site_is_animated_as_a_chosen_file(page: Page) -> None:
-    assert page.evaluate("[...document.getElementById('example').options].map((option) => option.text)") == [
-        "an example",  # the list's title
-        "an example",
+    assert page.evaluate("[...document.querySelectorAll('#examples button')].map((each) => each.textContent)") == [
+        "an example"
     ]
-    page.evaluate("document.getElementById('example').selectedIndex = 1")
-    page.evaluate("document.getElementById('example').dispatchEvent(new Event('change'))")
+    page.evaluate("document.querySelector('#examples button').click()")
     page.wait_for("facediff.finished || facediff.errors.length")
     assert page.evaluate("[facediff.page.animated.name, facediff.page.animated.frames]") == ["an example", 30]
+
+
+def test_the_head_sways_while_it_speaks_unless_that_is_switched_off(page: Page) -> None:
+    lean = "(facediff.page.stage.sway({}), Math.max(...facediff.page.stage.camera.lean.map(Math.abs)))"
+    assert page.evaluate(lean.format("null")) == page.evaluate(lean.format(0)) == 0
+    most = max(page.evaluate(lean.format(time)) for time in range(1, 20))
+    assert np.deg2rad(0.5) < most < np.deg2rad(2.5)
+    page.evaluate("document.getElementById('sway').click()")
+    page.evaluate("facediff.page.show(new Float32Array(facediff.page.size), 5)")
+    assert page.evaluate("facediff.page.stage.camera.lean") == [0, 0]
+    page.evaluate("document.getElementById('sway').click()")
 
 
 @pytest.mark.parametrize("rate", [44_100, 48_000, 8000])

@@ -126,8 +126,8 @@ class ExportedModel {
     this.hurry(false);
   }
 
-  /** Args: ONNX Runtime; the folder's address; what computes, by its names; what hears a share of all bytes. */
-  static async open(ort, base, providers, onProgress) {
+  /** A folder's description and arrays, which are enough to show a face. Args: the folder's address. */
+  static async read(base) {
     const text = await fetchBytes(base, "model.json", undefined, MOST_DESCRIPTION);
     let about;
     try {
@@ -136,12 +136,16 @@ class ExportedModel {
       throw new Error("model.json: is no JSON; export the model again");
     }
     checkDescription(about);
-    const names = ["arrays.npz", ...loadedGraphs(about).map((graph) => `${graph}.onnx`)];
-    const total = names.reduce((sum, name) => sum + about.sizes[name], 0);
+    const arrays = await readArrays(await fetchBytes(base, "arrays.npz", about.sizes["arrays.npz"], MOST_GRAPH), "arrays.npz");
+    checkArrays(about, arrays);
+    return { about, arrays };
+  }
+
+  /** Args: ONNX Runtime; the folder's address, and what was read of it; what computes, by its names; what hears a share of all bytes. */
+  static async open(ort, base, { about, arrays }, providers, onProgress) {
+    const total = loadedGraphs(about).reduce((sum, graph) => sum + about.sizes[`${graph}.onnx`], 0);
     let come = 0;
     const onBytes = (count) => onProgress((come += count) / total);
-    const arrays = await readArrays(await fetchBytes(base, names[0], about.sizes[names[0]], MOST_GRAPH, onBytes), names[0]);
-    checkArrays(about, arrays);
     const sessions = {};
     for (const graph of loadedGraphs(about)) {
       const name = `${graph}.onnx`;

@@ -81,7 +81,7 @@ class Listening {
     }
     if (!due) return;
     this.shown = due.number;
-    this.page.show(due.offsets);
+    this.page.show(due.offsets, due.number / this.page.about.frame_rate);
     if (now - this.saidAt < SAID_EVERY) return;
     this.saidAt = now;
     this.page.say(`listening: the face is ${this.lag.toFixed(1)} s behind` + (this.dropped ? `, ${this.dropped} frames left out` : ""));

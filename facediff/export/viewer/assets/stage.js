@@ -62,6 +62,14 @@ class Stage {
     this.stir();
   }
 
+  /** Turn the head a little, as people do who speak. Args: seconds since they began; null for a head at rest. */
+  sway(time) {
+    const at = (...rates) => rates.reduce((sum, rate, n) => sum + Math.sin(2 * Math.PI * rate * (time ?? 0) + 2 * n) / (n + 1), 0);
+    const share = time === null ? 0 : 0.02 * Math.min(1, time); // radians
+    this.camera.lean = [share * at(0.13, 0.31, 0.57), 0.7 * share * at(0.19, 0.43, 0.71)];
+    this.dirty = true;
+  }
+
   /** Show the edges of the triangles, or not. */
   setEdges(on) {
     this.edges = on;

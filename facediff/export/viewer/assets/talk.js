@@ -30,6 +30,7 @@ class TalkingPage {
     this.playing = this.waits = false; // whether somebody wants it to play, and whether it waits for the model
     this.about = null;
     this.clock = new SilentClock(0);
+    this.calm = matchMedia("(prefers-reduced-motion: reduce)");
   }
 
   /** Load the model by a worker. Args: what computes, wasm or webgpu. */
@@ -37,6 +38,7 @@ class TalkingPage {
     this.stopListening();
     this.worker?.terminate();
     this.job = null;
+    this.loaded = false;
     this.settle();
     if (location.protocol === "file:") throw new Error("a browser lets no page of a file load a model: run  facediff serve FOLDER  or put this folder on any web server");
     this.worker = new Worker("worker.js", { type: "module" });
@@ -52,11 +54,16 @@ class TalkingPage {
     this.threads = threads;
     this.say("loading the model …", 0);
     this.send({ kind: "open", id: 0, base: new URL("model/", location.href).href, runtime: new URL("onnxruntime/", location.href).href, device, threads });
-    const { about, arrays } = await opened;
-    if (this.about) {
-      this.inform();
-      return this.say("");
-    }
+    const first = !this.about;
+    await opened;
+    this.loaded = true;
+    this.inform();
+    this.say(first ? "hear an example, open a recording, drop one here, or switch the microphone on" : "");
+  }
+
+  /** Show the face that the model moves, while the rest of it still loads. */
+  meet({ about, arrays }) {
+    if (this.about) return;
     Object.assign(this, { about, arrays });
     this.size = 3 * arrays.templates.shape[1];
     const faces = Uint32Array.from(arrays.faces.data);
@@ -64,8 +71,7 @@ class TalkingPage {
     this.stage = new Stage(find("view"), find("stage"), { template: this.template(0), faces, colours: this.colours(0) }, about.frame_rate);
     this.stage.push(null);
     this.fill();
-    this.inform();
-    this.say("open a recording, drop one here, or switch the microphone on");
+    document.body.classList.add("ready");
   }
 
   send(message, transfer = []) {
@@ -83,7 +89,9 @@ class TalkingPage {
     return shape.length === 3 ? data.slice(number * this.size, (number + 1) * this.size) : data;
   }
 
-  show(offsets) {
+  /** Args: offsets from the face at rest, and the seconds of speech at which the head sways. */
+  show(offsets, time) {
+    this.stage.sway(find("sway").checked && !this.calm.matches ? time : null);
     this.scaled ??= new Float32Array(this.size);
     for (let i = 0; i < this.size; i++) this.scaled[i] = offsets[i] * this.facts.millimetres;
     this.stage.push(this.scaled);
@@ -133,7 +141,8 @@ class TalkingPage {
   /** Show the chosen face, and its own style if it has one. */
   wear() {
     const name = find("identity").value;
-    if (this.about.styles.includes(name)) find("style").value = name;
+    const style = [`${name}_lively`, name].find((each) => this.about.styles.includes(each));
+    if (style) find("style").value = style;
     const number = this.about.faces.indexOf(name);
     this.stage.wear(this.template(number), this.colours(number));
   }
@@ -152,9 +161,9 @@ class TalkingPage {
 
   /** Buttons as what happens now allows. */
   settle() {
-    const busy = Boolean(this.job), hears = Boolean(this.listening), ready = Boolean(this.about);
+    const busy = Boolean(this.job), hears = Boolean(this.listening), ready = this.loaded;
     find("cancel").hidden = !busy;
-    for (const id of ["open", "example"]) find(id).disabled = !ready || busy || hears;
+    for (const button of [find("open"), ...find("examples").children]) button.disabled = !ready || busy || hears;
     find("again").disabled = !ready || busy || hears || !this.recording;
     find("microphone").disabled = !ready || busy;
     find("microphone").setAttribute("aria-pressed", String(hears));
@@ -257,6 +266,7 @@ class TalkingPage {
   /** What the worker says. */
   answer(data) {
     if (data.kind === "loading") this.say("loading the model …", data.share);
+    else if (data.kind === "face") this.meet(data);
     else if (data.kind === "opened") this.opening.resolve(data);
     else if (data.kind === "failed") this.fail(data);
     else if (this.listening?.id === data.id) this.hear(data);
@@ -420,7 +430,7 @@ class TalkingPage {
     }
     if (frame === this.shown) return;
     this.shown = frame;
-    this.show(animated.at(frame));
+    this.show(animated.at(frame), frame / animated.frameRate);
     find("scrub").value = frame;
     find("scrub").style.setProperty("--done", animated.frames > 1 ? frame / (animated.frames - 1) : 1);
     find("scrub").setAttribute("aria-valuetext", `frame ${frame}, ${(frame / animated.frameRate).toFixed(2)} seconds`);
@@ -521,13 +531,12 @@ class TalkingPage {
       find("file").value = "";
       if (file) this.open(file).catch(report);
     });
-    find("example").append(...this.facts.recordings.map((name) => new Option(name.replace(/\.[^.]*$/, ""), name)));
+    for (const name of this.facts.recordings) {
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: name.replace(/\.[^.]*$/, ""), disabled: true });
+      button.addEventListener("click", () => this.openExample(name).catch(report));
+      find("examples").append(button);
+    }
     find("examples").hidden = !this.facts.recordings.length;
-    find("example").addEventListener("change", () => {
-      const name = find("example").value;
-      find("example").value = "";
-      if (name) this.openExample(name).catch(report);
-    });
     find("identity").addEventListener("change", () => {
       this.pause();
       this.animated = null;
@@ -600,7 +609,6 @@ async function start() {
   page.tick();
   page.settle();
   window.facediff.ready = true;
-  document.body.classList.add("ready");
 }
 
 start().catch(report);

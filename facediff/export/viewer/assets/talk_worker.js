@@ -46,13 +46,14 @@ class Outlet {
 const actions = {
   /** Load ONNX Runtime and the model. */
   async open({ id, base, runtime, device, threads }) {
+    const face = await ExportedModel.read(base);
+    postMessage({ kind: "face", id, ...face });
     const ort = await import(new URL(device === "webgpu" ? "ort.webgpu.min.mjs" : "ort.wasm.min.mjs", runtime));
     Object.assign(ort.env.wasm, { wasmPaths: String(runtime), numThreads: threads, proxy: false });
     ort.env.logLevel = "error";
     const providers = device === "webgpu" ? ["webgpu", "wasm"] : ["wasm"];
-    model = await ExportedModel.open(ort, base, providers, (share) => postMessage({ kind: "loading", id, share }));
-    const { about, arrays } = model;
-    postMessage({ kind: "opened", id, about, arrays });
+    model = await ExportedModel.open(ort, base, face, providers, (share) => postMessage({ kind: "loading", id, share }));
+    postMessage({ kind: "opened", id });
   },
 
   /** Animate a recording. Args: windows other than the model's, `quick` ones in few steps; a gate, or null. */
