@@ -32,7 +32,7 @@ def extract(
     """
     check_model_source(checkpoint, "--checkpoint")
 
-    from facediff.animation.style_files import marked
+    from facediff.animation.styles import marked
     from facediff.models import ManyFaces, load_model
     from facediff.models.styles import extract_style, still_style
     from facediff.utils.files import atomic

@@ -134,11 +134,12 @@ def person(
 
 def with_tracked_styles(style: str, checkpoint: Path | str) -> str:
     """The words of ``--style`` with a motion, on the model's face, in place of each video of a person."""
-    from facediff.animation.style_files import split_styles
     from facediff.speech.audio import VIDEOS
 
     if not style.lower().endswith(VIDEOS) and not any(f"{suffix}:" in style.lower() for suffix in VIDEOS):
         return style
+    from facediff.animation.styles import split_styles
+
     names = []
     for part in split_styles(style):
         is_video = Path(part.name).suffix.lower() in VIDEOS

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation.style_files import Stillness, stillness_of
+from facediff.animation.styles import Stillness, stillness_of
 from facediff.errors import FaceDiffError, MissingExtraError, check_known
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Description, packed_deltas, read_folder
 from facediff.utils import SAMPLE_RATE

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from facediff.animation.options import AnimationOptions, ExportOptions
-from facediff.animation.style_files import style_paths
+from facediff.animation.styles import style_paths
 from facediff.editing.controls import keys_file
 from facediff.errors import FaceDiffError, OptionError, check_known, printable
 from facediff.export import FORMATS, check_export

@@ -1,30 +1,15 @@
-"""Speaking styles of an exported model: by name, from a file, from motion, and mixtures, as ``--style`` takes them."""
+"""Speaking styles of an exported model: what :mod:`facediff.animation.styles` asks of one without PyTorch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation import metres_per_unit
-from facediff.animation.parameter_styles import channels_of, recorded_parameters
-from facediff.animation.style_files import (
-    FILES,
-    Stillness,
-    StyleFile,
-    frames_of,
-    normalised,
-    open_style,
-    split_styles,
-    stride_of,
-    style_given,
-    vector_in,
-)
+from facediff.animation.styles import Stillness, StyleFile, StyleReader
 from facediff.errors import FaceDiffError, OptionError, choices
 from facediff.runtime.graphs import ExportedGraphs
-from facediff.spaces.files import ParameterClip
 
 Array = npt.NDArray[np.float32]
 
@@ -43,92 +28,78 @@ class RuntimeStyle:
 
 
 def style_from(style: object, model: ExportedGraphs, identity: str) -> RuntimeStyle:
-    """The style that was given in Python; the model must take styles from reference motion.
+    """The style that was given in Python or in words; the model must take styles from reference motion.
 
     Args:
-        style: the words of ``--style``; a path; names or paths with their weights; a motion as an animation, or as an
-            array (T, V, 3) of absolute vertices; a style vector (S,); or what this function has returned.
+        style: as :meth:`facediff.animation.styles.StyleReader.style` takes it, or what this function has returned.
         model: the model.
         identity: the speaker of an array, unless a file's name says it.
     """
-    if isinstance(style, RuntimeStyle):
-        return style
-    reference = style_given(style, vertices=model.description.motion_space.is_vertices)
-    if isinstance(reference, str):
-        return read_style(reference, model, identity)
-    if isinstance(reference, ParameterClip):
-        return _of_parameters(reference, model, identity)
-    return _of_vertices(reference, model, identity)
+    return style if isinstance(style, RuntimeStyle) else ExportedStyles(identity, model).style(style)
 
 
-def read_style(text: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:
-    """The style that the text of ``--style`` names; the model must take styles from reference motion.
+class ExportedStyles(StyleReader[RuntimeStyle]):
+    """The styles of an exported model; see :func:`style_from`."""
 
-    Args:
-        text: a style's name, a file, or several of them with weights, ``F1:0.3,b.npz:0.7``.
-        model: the model.
-        identity: the speaker of a bare array (``.npy``), unless the file's name says it.
-    """
-    parts = split_styles(text, model.description.styles)
-    if len(parts) == 1:
-        return single_style(parts[0].name, model, identity)
-    shares = normalised(text, [part.weight for part in parts])
-    styles = [single_style(part.name, model, identity) for part in parts]
-    vector = np.sum([np.float32(share) * style.vector for share, style in zip(shares, styles, strict=True)], 0)
-    name = " + ".join(f"{share:.3g} {style.name}" for share, style in zip(shares, styles, strict=True))
-    return RuntimeStyle(name, vector.astype(np.float32))
+    def __init__(self, identity: str, model: ExportedGraphs) -> None:
+        about = model.description
+        vertices = model.arrays["templates"].shape[1]
+        super().__init__(identity, about.motion_space, vertices, about.frame_rate, about.unit)
+        self.model, self.about = model, about
 
+    @property
+    def width(self) -> int:
+        """S: how many numbers a style vector has."""
+        return int(self.model.arrays["styles"].shape[1])
 
-def single_style(name: str, model: ExportedGraphs, identity: str) -> RuntimeStyle:
-    """A style by its name in the folder, or from a file."""
-    about, vectors = model.description, model.arrays["styles"]
-    if name in about.styles:
-        return RuntimeStyle(name, vectors[about.styles.index(name)].astype(np.float32))
-    vertices = about.motion_space.is_vertices and name.endswith(FILES)
-    recorded = None if vertices else recorded_parameters(name, about.frame_rate)
-    if recorded is not None:
-        return _of_parameters(recorded, model, identity)
-    if not name.endswith(FILES):
-        raise OptionError("style", f'there is no "{name}", and it is no file: {choices(name, about.styles)}')
-    return _of_vertices(open_style(Path(name)), model, identity)
+    def names(self) -> list[str]:
+        """Names of the folder's styles."""
+        return self.about.styles
 
+    def named(self, name: str) -> RuntimeStyle | None:
+        """A style of the folder."""
+        if name not in self.about.styles:
+            return None
+        return RuntimeStyle(name, self.model.arrays["styles"][self.about.styles.index(name)].astype(np.float32))
 
-def _of_parameters(recorded: ParameterClip, model: ExportedGraphs, identity: str) -> RuntimeStyle:
-    about = model.description
-    values = channels_of(recorded, about.motion_space, about.frame_rate)
-    resting = model.arrays["resting"][about.faces.index(identity) if identity in about.faces else 0]
-    return encode_style(model, (values - resting)[..., None], recorded.name)
+    def clip(self, name: str) -> StyleFile:
+        """None: a folder has no clips."""
+        raise OptionError("style", f'there is no "{name}", and it is no file: {choices(name, self.about.styles)}')
 
+    def rest(self) -> Array:
+        """The channels (C,) of the face at rest."""
+        faces = self.about.faces
+        resting: Array = self.model.arrays["resting"][faces.index(self.identity) if self.identity in faces else 0]
+        return resting
 
-def _of_vertices(opened: StyleFile, model: ExportedGraphs, identity: str) -> RuntimeStyle:
-    """The style of motion in vertices, or a vector."""
-    about, vectors, path = model.description, model.arrays["styles"], opened.path
-    if opened.array.ndim == 1:
+    def face(self, opened: StyleFile) -> tuple[Array, str | None, float]:
+        """The neutral face (V, 3) of the speaker in a file's name, else of the identity, else of the first face."""
+        faces, candidates = self.about.faces, (opened.path.stem.rpartition("_")[0], self.identity)
+        whose = next((name for name in candidates if name in faces), faces[0])
+        return self.model.arrays["templates"][faces.index(whose)], whose, self.frame_rate
 
-        def still() -> Array:
-            return encode_style(model, np.zeros((1, *_points(model)), np.float32), "still").vector
+    def stillness(self) -> Stillness | None:
+        """As the folder states it."""
+        still = self.model.arrays.get("still")
+        return None if still is None else Stillness(still, self.about.stillness)
 
-        vector = vector_in(opened, vectors.shape[1], still if model.has("style") else None)
-        return RuntimeStyle(path.stem, vector)
-    if not about.motion_space.is_vertices:
-        raise OptionError.naming(
-            f"{{style}} {path}: holds vertices, and this model takes channels; give motion in parameters, a style of "
-            f"the folder, or a style vector of this model"
-        )
-    templates, rate, scale = model.arrays["templates"], opened.frame_rate or about.frame_rate, 1.0
-    whose = next((name for name in (path.stem.rpartition("_")[0], identity) if name in about.faces), about.faces[0])
-    face = templates[about.faces.index(whose)] if opened.template is None else opened.template
-    if opened.unit not in (None, about.unit):
-        scale = metres_per_unit(str(opened.unit)) / metres_per_unit(about.unit)
-    motion = frames_of(opened, templates.shape[1], stride_of(path, rate, about.frame_rate))
-    offsets = (scale * (motion - face)).astype(np.float32)
-    if "still" in model.arrays and Stillness(model.arrays["still"], about.stillness).another_face(offsets):
-        face_of = f"the neutral face of {whose}" if opened.template is None else "its own template"
-        raise OptionError.naming(
-            f"{{style}} {path}: does not lie on {face_of}, or the head moves; give an animation (.npz) of a head that "
-            f"keeps still, or an array that is named <identity>_<clip>.npy"
-        )
-    return encode_style(model, offsets, path.stem)
+    def still_vector(self) -> Array | None:
+        """The style vector (S,) of a face that keeps still; None where the folder has no style encoder."""
+        if not self.model.has("style"):
+            return None
+        return encode_style(self.model, np.zeros((1, *_points(self.model)), np.float32), "still").vector
+
+    def encode(self, name: str, offsets: Array) -> RuntimeStyle:
+        """The style of reference motion: offsets (T, points, dims) from rest."""
+        return encode_style(self.model, offsets, name)
+
+    def of_vector(self, name: str, vector: Array) -> RuntimeStyle:
+        """A style vector (S,) as a style."""
+        return RuntimeStyle(name, vector)
+
+    def vector(self, style: RuntimeStyle) -> tuple[str, Array]:
+        """The name of a style, and its style vector (S,)."""
+        return style.name, style.vector
 
 
 def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyle:

@@ -22,7 +22,7 @@ from facediff.cli.app import main
 from facediff.models import DualPathDiffusion, ManyFaces, load_model
 from facediff.models.checkpoint import corpus_of, read_checkpoint
 from facediff.models.dual_path.network import TRUNK
-from facediff.models.styles import read_styles, vector_of
+from facediff.models.styles import style_from, vector_of
 from tests.fakes.channels import TinyChannels, write_channels
 from tests.fakes.tiny import VERTICES, Tiny, tiny_model_options, write_tiny
 
@@ -164,7 +164,7 @@ def test_faces_take_each_others_styles(roots: dict[str, Path], trained: Path, tm
     clip, vector = roots["halved"] / "vertices_npy" / "A_e02.npy", tmp_path / "style.npy"
     assert main(["style", "extract", str(clip), "--checkpoint", f"{trained}:halved", "-o", str(vector)]) == 0
     model = load_model(trained)
-    np.testing.assert_array_equal(vector_of(read_styles(str(vector), "B", model), model), np.load(vector))
+    np.testing.assert_array_equal(vector_of(style_from(str(vector), "B", model), model), np.load(vector))
 
 
 def test_folders_of_publish_keep_all_faces(trained: Path, tmp_path: Path) -> None:

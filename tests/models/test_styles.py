@@ -12,11 +12,11 @@ import torch
 import trimesh
 
 from facediff.animation import Animation, write_archive
-from facediff.animation.style_files import Weighted, marked, split_styles, style_paths
+from facediff.animation.styles import Weighted, marked, split_styles, style_paths
 from facediff.data import Reference
 from facediff.errors import FaceDiffError
 from facediff.models import DiffPoseTalk, DualPathDiffusion, Style, import_checkpoint
-from facediff.models.styles import extract_style, read_style, read_styles, style_from
+from facediff.models.styles import extract_style, style_from
 from facediff.spaces.files import ParameterClip
 from facediff.spaces.layouts import layout
 from tests.fakes import published_parameters
@@ -53,21 +53,21 @@ def test_a_vector_of_another_model_is_refused(
     still = vector(Reference("still", torch.zeros(3, model.n_vertices, 3)), model)
     for written in (plain, marked(plain, still)):
         np.save(path, written)
-        style = read_style(str(path), "B", model)
+        style = style_from(str(path), "B", model)
         assert isinstance(style, Style)
         np.testing.assert_array_equal(style.vector, plain)
     with pytest.raises(FaceDiffError, match=r"a\.npy: is of another model.*style extract"):
-        read_style(str(path), "B", other.eval())
+        style_from(str(path), "B", other.eval())
     np.save(path, plain)
-    assert isinstance(read_style(str(path), "B", other), Style)
+    assert isinstance(style_from(str(path), "B", other), Style)
     shorter = len(plain) // 2
     for written in (plain[:shorter], marked(plain[:shorter], still[:shorter])):
         np.save(path, written)
         with pytest.raises(FaceDiffError, match=rf"holds {shorter} numbers.*have {len(plain)} "):
-            read_style(str(path), "B", model)
+            style_from(str(path), "B", model)
     np.save(path, np.append(plain[1:], np.inf))
     with pytest.raises(FaceDiffError, match="no NaN"):
-        read_style(str(path), "B", model)
+        style_from(str(path), "B", model)
 
 
 def test_what_is_a_file_or_a_clip_as_a_whole_is_one_style(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,15 +89,15 @@ def test_a_mixture_is_the_weighted_mean_of_style_vectors(
     own = np.linspace(-1, 1, len(a), dtype=np.float32)
     np.save(tmp_path / "own.npy", own)
 
-    mixed = read_styles(f"{clips['A']}:0.25,{clips['B']}:0.5,{tmp_path / 'own.npy'}:0.25", "A", model)
+    mixed = style_from(f"{clips['A']}:0.25,{clips['B']}:0.5,{tmp_path / 'own.npy'}:0.25", "A", model)
     assert isinstance(mixed, Style)
     np.testing.assert_allclose(mixed.vector, 0.25 * a + 0.5 * b + 0.25 * own, atol=1e-5)
     assert mixed.name == f"0.25 {clips['A']} + 0.5 {clips['B']} + 0.25 own"
     assert not capsys.readouterr().out
-    beyond = read_styles(f"{clips['A']}:3,{clips['B']}:-1", "A", model)
+    beyond = style_from(f"{clips['A']}:3,{clips['B']}:-1", "A", model)
     np.testing.assert_allclose(vector(beyond, model), 1.5 * a - 0.5 * b, atol=1e-5)
     assert capsys.readouterr().out == "note: --style: weights are divided by their sum: 1.5, -0.5\n"
-    alike = read_styles(f"{clips['A']},{clips['B']}", "A", model)
+    alike = style_from(f"{clips['A']},{clips['B']}", "A", model)
     np.testing.assert_allclose(vector(alike, model), (a + b) / 2, atol=1e-5)
     speech = torch.randn(16_000, generator=torch.Generator().manual_seed(0)) * 0.1
     assert torch.isfinite(model.animate(speech, identity="A", style=beyond).vertices).all()
@@ -118,17 +118,17 @@ def test_an_unseen_speakers_style_needs_their_template(
 ) -> None:
     path, face, offsets = unseen
     with pytest.raises(FaceDiffError, match="give that person's own with style_template"):
-        read_styles(str(path), "A", model)
+        style_from(str(path), "A", model)
     template = tmp_path / f"neutral.{suffix}"
     if suffix == "npy":
         np.save(template, face)
     else:
         trimesh.Trimesh(face, [[0, 1, 6], [22, 23, 17]], process=False).export(template)
-    style = read_styles(str(path), "A", model, template=template)
+    style = style_from(str(path), "A", model, template=template)
     assert isinstance(style, Reference)
     np.testing.assert_allclose(style.motion, offsets, atol=2e-6)
     other = model.assets.references["A"].clip
-    mixed = read_styles(f"{other}:0.5,{path}:0.5", "A", model, template=template)
+    mixed = style_from(f"{other}:0.5,{path}:0.5", "A", model, template=template)
     halves = 0.5 * vector(model.assets.references["A"], model) + 0.5 * vector(style, model)
     np.testing.assert_allclose(vector(mixed, model), halves, atol=1e-5)
 
@@ -140,23 +140,23 @@ def test_a_take_brings_its_template_unit_and_frame_rate(
     twice = np.repeat(face + offsets, 2, axis=0) * 1000
     animation = Animation("zoe", twice.astype(np.float32), (face * 1000).astype(np.float32), 50.0, unit="mm")
     write_archive(tmp_path / "zoe.npz", animation)
-    style = read_style(str(tmp_path / "zoe.npz"), "A", model)
+    style = style_from(str(tmp_path / "zoe.npz"), "A", model)
     assert isinstance(style, Reference)
     np.testing.assert_allclose(style.motion, offsets, atol=2e-6)
     write_archive(tmp_path / "slow.npz", replace(animation, frame_rate=30.0))
     with pytest.raises(FaceDiffError, match="has 30 frames a second, the model 25"):
-        read_style(str(tmp_path / "slow.npz"), "A", model)
+        style_from(str(tmp_path / "slow.npz"), "A", model)
     moving = twice + 40.0 * np.sin(np.arange(len(twice)))[:, None, None]
     write_archive(tmp_path / "moving.npz", replace(animation, vertices=moving.astype(np.float32)))
     with pytest.raises(FaceDiffError, match="does not lie on its template: the head moves"):
-        read_style(str(tmp_path / "moving.npz"), "A", model)
+        style_from(str(tmp_path / "moving.npz"), "A", model)
 
 
 def test_the_median_stands_for_a_template_with_a_note(
     unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, face, offsets = unseen
-    style = read_style(str(path), "A", model, template="median")
+    style = style_from(str(path), "A", model, template="median")
     assert isinstance(style, Reference)
     np.testing.assert_allclose(style.motion, offsets - np.median(offsets, axis=0), atol=2e-6)
     assert "the median of its" in capsys.readouterr().out
@@ -186,13 +186,13 @@ def test_motion_in_parameters_is_a_style_by_its_layout(of_channels: DiffPoseTalk
     np.savez(tmp_path / "clip.npz", exp=values[:, :50], pose=values[:, 50:], shape=np.zeros(100, np.float32))
     np.save(tmp_path / "clip.npy", values)
     for name in ("clip.npz", "clip.npy"):
-        style = read_styles(f"{tmp_path / name}@flame_diffposetalk", person, of_channels)
+        style = style_from(f"{tmp_path / name}@flame_diffposetalk", person, of_channels)
         assert isinstance(style, Reference)
         assert np.array_equal(style.motion[..., 0], values)
         with pytest.raises(FaceDiffError, match="flame_diffposetalk"):
-            read_styles(str(tmp_path / name), person, of_channels)
+            style_from(str(tmp_path / name), person, of_channels)
     with pytest.raises(FaceDiffError, match="no such file"):
-        read_styles("missing.npy@flame_artalk", person, of_channels)
+        style_from("missing.npy@flame_artalk", person, of_channels)
 
 
 def test_another_layouts_channels_are_taken_by_name(of_channels: DiffPoseTalk, tmp_path: Path) -> None:
@@ -202,12 +202,12 @@ def test_another_layouts_channels_are_taken_by_name(of_channels: DiffPoseTalk, t
     np.save(tmp_path / "natural.npy", values)
     expected = np.concatenate([values[:, :50], values[:, 100:]], 1)
     for words in (str(tmp_path / "natural.pt"), f"{tmp_path / 'natural.npy'}@flame_artalk"):
-        style = read_styles(words, of_channels.identities[0], of_channels)
+        style = style_from(words, of_channels.identities[0], of_channels)
         assert isinstance(style, Reference)
         assert np.array_equal(style.motion[..., 0], expected)
     torch.save({"x": torch.zeros(3)}, tmp_path / "other.pt")
     with pytest.raises(FaceDiffError, match=r"other.pt"):
-        read_styles(str(tmp_path / "other.pt"), of_channels.identities[0], of_channels)
+        style_from(str(tmp_path / "other.pt"), of_channels.identities[0], of_channels)
 
 
 def test_parameters_are_resampled_and_mixed_as_vectors(of_channels: DiffPoseTalk, tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_parameters_are_resampled_and_mixed_as_vectors(of_channels: DiffPoseTalk
     np.save(tmp_path / "a.npy", values_of(56))
     np.save(tmp_path / "b.npy", 2 * values_of(56))
     words = [f"{tmp_path / name}@flame_diffposetalk" for name in ("a.npy", "b.npy")]
-    mixed = read_styles(f"{words[0]}:0.25,{words[1]}:0.75", person, of_channels)
+    mixed = style_from(f"{words[0]}:0.25,{words[1]}:0.75", person, of_channels)
     assert isinstance(mixed, Style)
     first, second = (extract_style([word], person, of_channels) for word in words)
     torch.testing.assert_close(mixed.vector, 0.25 * first + 0.75 * second)

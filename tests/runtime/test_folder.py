@@ -76,14 +76,14 @@ def test_a_recording_in_weights_is_a_style(folder: Path, tmp_path: Path, monkeyp
     write_parameters(tmp_path / "take.csv", ParameterClip("take", values, live_link, 25.0))
     model, encoded = RuntimeModel.open(folder), []
     monkeypatch.setattr(styles, "encode_style", lambda _, motion, name: encoded.append((motion, name)))
-    styles.read_style(str(tmp_path / "take.csv"), model, "A")
+    styles.style_from(str(tmp_path / "take.csv"), model, "A")
     ((motion, name),) = encoded
     assert (name, motion.shape) == ("take", (25, STATE, 1))
     jaw = values[:, live_link.index("jawOpen")]
     np.testing.assert_allclose(motion[:, CHANNELS.index("jawOpen"), 0], jaw, atol=1e-6)
     np.save(tmp_path / "motion.npy", np.zeros((5, 6, 3), np.float32))
     with pytest.raises(FaceDiffError, match=r"motion\.npy"):
-        styles.read_style(str(tmp_path / "motion.npy"), model, "A")
+        styles.style_from(str(tmp_path / "motion.npy"), model, "A")
 
 
 def test_the_page_says_that_it_plays_vertices_only(folder: Path) -> None:

@@ -23,7 +23,7 @@ import facediff
 from facediff import registry
 from facediff.animation import write_archive
 from facediff.animation.options import AnimationOptions
-from facediff.animation.style_files import marked
+from facediff.animation.styles import marked
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
@@ -35,7 +35,7 @@ from facediff.pipelines.export_model import Precision, compare, export_model, st
 from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime import RuntimeModel
 from facediff.runtime.noise import NormalStream, NumpyClipNoise, NumpyWindowNoise
-from facediff.runtime.styles import read_style, style_from
+from facediff.runtime.styles import style_from
 from facediff.speech.voice_activity import QUICK_GATE
 from facediff.speech.windows import MotionWindow, WindowPlan
 from tests.fakes.tiny import Tiny, tiny_model_options
@@ -239,15 +239,17 @@ def test_style_comes_from_a_file_or_a_mixture(model: AnimationModel, folder: Pat
     np.save(tmp_path / "marked.npy", marked(own, still))  # as `facediff style extract` writes it
     np.save(tmp_path / "another.npy", marked(own, still[::-1]))
     with pytest.raises(FaceDiffError, match=r"another\.npy: is of another model"):
-        read_style(str(tmp_path / "another.npy"), runtime, "A")
+        style_from(str(tmp_path / "another.npy"), runtime, "A")
     with pytest.raises(OptionError) as caught:
-        read_style("Zoe", runtime, "A")
+        style_from("Zoe", runtime, "A")
     assert caught.value.on_command_line.startswith('--style: there is no "Zoe"')
+    with pytest.raises(FaceDiffError, match="one style alone cannot be weighted"):
+        style_from("A:0.5", runtime, "A")
     for name in ("b.npz", "B_1.npy", "vector.npy", "marked.npy"):
-        found = read_style(str(tmp_path / name), runtime, "A")
+        found = style_from(str(tmp_path / name), runtime, "A")
         np.testing.assert_allclose(found.vector, own, atol=1e-5)
         assert found.name == Path(name).stem
-    mixed = read_style(f"A:0.25,{tmp_path / 'b.npz'}:0.75", runtime, "A")
+    mixed = style_from(f"A:0.25,{tmp_path / 'b.npz'}:0.75", runtime, "A")
     wanted = 0.25 * runtime.arrays["styles"][runtime.description.styles.index("A")] + 0.75 * own
     np.testing.assert_allclose(mixed.vector, wanted, atol=1e-5)
 

@@ -21,7 +21,7 @@ from facediff.models import Voca, import_checkpoint, load_model
 from facediff.models.deepspeech import DeepSpeechEncoder, cepstra
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.importing import import_files, save_model
-from facediff.models.styles import read_styles
+from facediff.models.styles import style_from
 from tests.fakes import voca
 from tests.fakes.tiny import Tiny
 from tests.fakes.voca import IDENTITIES, VERTICES, write_arrays, write_voca
@@ -89,7 +89,7 @@ def test_a_style_mixes_vertices(shares: tuple[float, ...], tmp_path: Path) -> No
     """Also where one weight alone is 1, and others lead away from a style."""
     model, speech = imported(write_voca(tmp_path)), speech_of(3000)
     words = ",".join(f"{name}:{share}" for name, share in zip(IDENTITIES, shares, strict=True))
-    made = model.animate(speech, identity="A", style=read_styles(words, "A", model)).vertices
+    made = model.animate(speech, identity="A", style=style_from(words, "A", model)).vertices
     parts = [share * voca.voca_reference(speech.numpy(), k, templates()["A"]) for k, share in enumerate(shares)]
     torch.testing.assert_close(made.flatten(1), torch.from_numpy(sum(parts)).float(), rtol=0, atol=1e-5)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.animation.parameter_styles import channels_of, recorded_parameters
+from facediff.animation.styles import channels_of, recorded_parameters
 from facediff.errors import FaceDiffError
 from facediff.spaces import VERTICES
 from facediff.spaces.files import ParameterClip, write_parameters
