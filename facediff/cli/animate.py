@@ -129,10 +129,10 @@ def animate(
     )
     files = replace(files, quiet=quiet)
     if isinstance(generation.style, str):
-        from facediff.cli.track import with_tracked_styles
+        from facediff.pipelines.animator import load
+        from facediff.pipelines.video_styles import with_video_styles
 
-        words = with_tracked_styles(generation.style, checkpoint)
-        generation = replace(generation, style=words)
+        generation = replace(generation, style=with_video_styles(generation.style, lambda: load(checkpoint)))
     if target.target_mesh is not None and not target.carry:
         from facediff.export.glb_own_shapes import shapes_to_drive
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +16,6 @@ from facediff.utils import SAMPLE_RATE, ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
-    from facediff.animation import Animation
     from facediff.data.track.recording import Recording
     from facediff.data.track.video import Picture
 
@@ -29,6 +28,10 @@ ONE_PERSON = ("--model.audio_encoder.frozen=false", "--data.augmentations=null",
 """Settings that were measured with one person, docs/results/people.md."""
 PREVIEW_RATE, CURVES = 25, 96
 """Frames a second, and height of the curves in pixels."""
+LAGS, EARLY, MOST_LAG, ALIKE = 5, 1, 2, 0.4
+"""Frames by which sound and mouth are compared; by which the bundled model moves earlier than people; by which they
+may differ otherwise; and the correlation from which on the comparison counts."""
+CLIPS = 8  # of a person, that are compared
 
 
 def track(
@@ -69,7 +72,7 @@ def track(
             scheduler=work.scheduler,
             progress=not work.quiet,
         )
-    tell(*report.lines())
+    tell(*report.lines(), *sync_warnings(output, [person.name for person in report.people]))
     if preview is not None:
         write_preview(report.first, preview)
         tell(f"{preview}: look whether the points follow lips and lids")
@@ -113,7 +116,7 @@ def person(
         raise FaceDiffError(f"{video}: holds several people's videos; expected one's, or use `facediff data track`")
     with resumable(output):
         tracked = track_people(videos, root, tracking, workers=None, progress=not quiet)
-        tell(*tracked.lines())
+        tell(*tracked.lines(), *sync_warnings(root, videos))
         if not check(root, None, progress=not quiet).sound:
             raise FaceDiffError(f"{root}: is not sound; `facediff data check {root}` says why")
         data = People(root=str(root))
@@ -132,62 +135,38 @@ def person(
     )
 
 
-def with_tracked_styles(style: str, checkpoint: Path | str) -> str:
-    """The words of ``--style`` with a motion, on the model's face, in place of each video of a person."""
-    from facediff.speech.audio import VIDEOS
+def sync_warnings(root: Path, people: Iterable[str]) -> Iterator[str]:
+    """Warnings about people of a corpus with sound that is out of step, by the mouth of the bundled model.
 
-    if not style.lower().endswith(VIDEOS) and not any(f"{suffix}:" in style.lower() for suffix in VIDEOS):
-        return style
-    from facediff.animation.styles import split_styles
-
-    names = []
-    for part in split_styles(style):
-        is_video = Path(part.name).suffix.lower() in VIDEOS
-        name = tracked_style(Path(part.name), checkpoint) if is_video else part.name
-        names.append(str(name) if part.weight is None else f"{name}:{part.weight!r}")
-    return ",".join(names)
-
-
-def tracked_style(video: Path, checkpoint: Path | str) -> Path:
-    """A file with the motion of a video's first clip on the face of a model; it is kept for the next time."""
+    Args:
+        root: corpus of ``facediff data track``.
+        people: names.
+    """
     import numpy as np
 
-    import facediff
-    from facediff.data.preparation import write_mesh
-    from facediff.data.track.corpus import track_people
-    from facediff.utils.arrays import ArrayStore
-    from facediff.utils.checksums import sha256
-    from facediff.utils.files import cache_dir, scratch_folder
+    from facediff.data.corpus import LIP_PAIRS, read_manifest
+    from facediff.data.track.face import pair_distances
+    from facediff.metrics import LipPairs
+    from facediff.pipelines.animator import load
+    from facediff.speech.audio import read_speech
+    from facediff.utils.cross_correlation import correlations, peak
 
-    model = facediff.load(checkpoint)
-    key = ArrayStore.key(sha256(video), model.corpus, model.n_vertices)
-    target = cache_dir() / "styles" / key / f"{video.stem}.npz"
-    if target.is_file():
-        return target
-    with scratch_folder(target) as scratch:
-        track_people({"style": [video]}, scratch / "people", TrackingOptions(face="largest"), workers=1)
-        motion = first_clip(scratch / "people")
-        if model.n_vertices != len(motion.template):
-            still = model.animate(np.zeros(SAMPLE_RATE, np.float32), SAMPLE_RATE, seed=0)
-            face = scratch / "face.ply"
-            write_mesh(face, still.template, still.triangles)
-            motion = motion.retarget(face)
-        motion.save(target)
-    return target
-
-
-def first_clip(root: Path) -> Animation:
-    """The first clip of a corpus of people as an animation."""
-    from facediff.animation import Animation
-    from facediff.data import People
-    from facediff.pipelines.trained import facts_of
-
-    corpus = (data := People(root=str(root))).corpus
-    clip = next(iter(corpus.clips.values()))
-    template = corpus.template(clip)
-    speech = corpus.read_audio(clip, 0, corpus.frames(clip)).numpy()
-    facts = facts_of(data.assets(), clip.identity)
-    return Animation(name=clip.name, vertices=(corpus.read_motion(clip) + template).numpy(), speech=speech, **facts)
+    model, rate = load("puppet"), read_manifest(root)["frame_rate"]
+    pairs = LipPairs.from_file(root / LIP_PAIRS).pairs
+    for person in people:
+        scores = []
+        for file in sorted((root / "vertices_npy").glob(f"{person}_s*.npy"))[:CLIPS]:
+            frames = np.load(file, mmap_mode="r")
+            gaps = pair_distances(frames.reshape(len(frames), -1, 3), pairs)
+            animation = model.animate(read_speech(root / "wav" / f"{file.stem}.wav"), SAMPLE_RATE, seed=0)
+            expected = pair_distances(animation.vertices, animation.inner_lip_pairs)
+            times = np.arange(len(expected)) / model.frame_rate
+            scores.append(correlations(np.interp(times, np.arange(len(gaps)) / rate, gaps), expected, LAGS, 2 * LAGS))
+        mean = np.mean(scores, axis=0)
+        late = peak(mean) - EARLY
+        if mean.max() >= ALIKE and abs(late) >= MOST_LAG:
+            size = f"about {1000 * abs(late) / model.frame_rate:.0f} ms {'early' if late > 0 else 'late'}"
+            yield f"warning: {person}: the sound is {size}; shift it in the video"
 
 
 def write_preview(recording: Recording, path: Path) -> None:

@@ -26,6 +26,7 @@ from facediff.editing.controls import direction_for, keys_of, refuse_folder
 from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options
 from facediff.pipelines.motion import Samples
+from facediff.pipelines.video_styles import with_video_styles
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hints import check_number
 from facediff.utils.hub import EXPECTED_TO_ANIMATE, check_animating_source, is_audio2face, is_exported, model_or_bundled
@@ -508,6 +509,7 @@ class Animator:
         precision = precision_of(self.dtype if dtype is None else dtype)
         if dtype is not None and options.get("precision", precision) != precision:
             raise OptionError("precision", f"contradicts dtype {dtype}; give one of them", options["precision"])
+        options["style"] = with_video_styles(options.get("style"), lambda: self)
         settings = AnimationOptions(checkpoint=self.source, **{"precision": precision, **options})
         check_options(settings)
         return settings
@@ -524,7 +526,8 @@ class Animator:
         Raises:
             FaceDiffError: if a clip cannot be read, is a style vector already, or the model has no style.
         """
-        references: list[StyleLike] = list(clips) if isinstance(clips, list | tuple) else [cast("StyleLike", clips)]
+        listed = list(clips) if isinstance(clips, list | tuple) else [clips]
+        references = [cast("StyleLike", with_video_styles(clip, lambda: self)) for clip in listed]
         vector = self.backend.extract_style(references, identity or self.identities[0])
         if not len(vector):
             raise FaceDiffError(f"{self.source}: was trained without a dynamic style, so it has no style vectors")

@@ -33,7 +33,7 @@ from facediff.data.track.face import (
     smooth_by_region,
     smooth_soft,
 )
-from facediff.data.track.model import LICENCE, POINTS, FaceModel, read_face_model
+from facediff.data.track.model import LICENCE, POINTS, SHA256, FaceModel, read_face_model
 from facediff.data.track.options import TrackingOptions
 from facediff.data.track.recording import Recording, RecordingSummary, summarise, video_tracker
 from facediff.data.track.topology import BROWS, EYELID_PAIRS, LIP_PAIRS, LIPS, UPPER_FACE, without_webs
@@ -42,7 +42,6 @@ from facediff.speech.audio import SAMPLE_RATE, VIDEOS, fit_length, samples_for
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
-from facediff.utils.cross_correlation import correlations, peak
 from facediff.utils.files import atomic, locked
 from facediff.utils.licences import KNOWN, Licence
 from facediff.utils.plain_files import write_json, write_rows
@@ -59,8 +58,6 @@ SAMPLE = 600  # frames of a person of which the median face is made
 IRIS = 11.7  # millimetres that people's irises measure
 SMALL_FACE, SLOW, REPEATED, OPEN, NOISY_BROWS = 80, 24, 0.05, 0.9, 1.4
 """Limits of warnings: pixels, frames a second, share of pictures, share of frames, difference ratio."""
-LAGS, MOST_LAG, SYNC_SECONDS = 5, 2, 15
-"""Frames by which sound and mouth are compared and may differ, and seconds that it takes to tell."""
 CHANNELS = ("head_npy", "gaze_npy", "confidence_npy")
 
 
@@ -76,29 +73,35 @@ class PersonReport:
     neutral_gap: float  # millimetres between the lips of the neutral face
     warnings: tuple[str, ...]
 
-    def lines(self) -> list[str]:
-        """The report, a line each."""
+    def line(self) -> str:
+        """The report in a line."""
         parts = ", ".join(f"{count} {split}" for split, count in self.splits.items())
-        return [
+        return (
             f"{self.name}: {counted(self.clips, 'clip')} ({parts}), {self.seconds / 60:.1f} min; irises measure "
-            f"{self.iris:.1f} mm, lips of the neutral face are {self.neutral_gap:.1f} mm apart",
-            *(f"warning: {self.name}: {text}" for text in self.warnings),
-        ]
+            f"{self.iris:.1f} mm, lips of the neutral face are {self.neutral_gap:.1f} mm apart"
+        )
 
 
 @dataclass(frozen=True)
 class TrackingReport:
     """The clips that were written, and the videos that could not be used, with the reasons."""
 
-    out: Path
     people: tuple[PersonReport, ...]
     failed: dict[str, str]
     first: Recording  # the first video that was used
+    digest: str  # SHA-256 of the face model
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should look at, a line each."""
+        version = f"the face model has SHA-256 {self.digest}; the limits of tracking were measured with {SHA256}"
+        people = [f"{person.name}: {text}" for person in self.people for text in person.warnings]
+        return [f"warning: {text}" for text in [*([] if self.digest == SHA256 else [version]), *people]]
 
     def lines(self) -> list[str]:
         """The report, a line each."""
         problems = [f"not used: {problem}" for problem in self.failed.values()]
-        return [*(line for person in self.people for line in person.lines()), *problems]
+        return [*(person.line() for person in self.people), *self.warnings, *problems]
 
 
 def find_videos(source: Path, name: str | None) -> dict[str, list[Path]]:
@@ -173,7 +176,7 @@ def track_people(
             raise FaceDiffError(next(iter(failed.values())))
         writer.finish({**manifest.get("people", {}), **{report.name: asdict(report) for report in reports}}, recipe)
         (out / STATE).unlink()
-    return TrackingReport(out, tuple(reports), failed, writer.recordings[0])
+    return TrackingReport(tuple(reports), failed, writer.recordings[0], model.digest)
 
 
 def import_video(video: Path, name: str, corpus: Path, out: Path, clip_seconds: float) -> TrackingReport:
@@ -281,7 +284,7 @@ class PeopleWriter:
             splits=dict(Counter(clip.row["split"] for clip in clips)),
             iris=iris,
             neutral_gap=float(pair_distances(self.templates[name][None])[0]) / METRES,
-            warnings=tuple(warnings(recordings, clips, self.options.frame_rate)),
+            warnings=tuple(warnings(recordings, clips)),
         )
 
     def _remove(self, name: str) -> None:
@@ -402,15 +405,7 @@ def difference_ratio(motion: Array) -> float:
     return float(np.sqrt(np.nanmean(np.square(np.diff(first, axis=0)))) / max(scale, 1e-12))
 
 
-def sound_lag(clips: Sequence[WrittenClip]) -> float:
-    """Frames by which the mouth opens after the sound, by the correlation of its gap with the loudness."""
-    scores = [correlations(clip.gaps, clip.loud, LAGS, 2 * LAGS) for clip in clips if len(clip.gaps) > 4 * LAGS]
-    return peak(np.mean(scores, axis=0)) if scores else 0.0
-
-
-def warnings(
-    recordings: Sequence[tuple[Recording, RecordingSummary]], clips: Sequence[WrittenClip], rate: float
-) -> Iterator[str]:
+def warnings(recordings: Sequence[tuple[Recording, RecordingSummary]], clips: Sequence[WrittenClip]) -> Iterator[str]:
     """Warnings about a person's videos."""
     for recording, summary in recordings:
         name = recording.source.name
@@ -425,9 +420,6 @@ def warnings(
         yield "the mouth is open in more than 90 % of the frames; the neutral face may be wrong"
     if len(clips) == 1:
         yield "a person's only clip belongs to no split; more video gives more clips"
-    late = sound_lag(clips) if len(gaps) >= SYNC_SECONDS * rate else 0.0
-    if abs(late) >= MOST_LAG:
-        yield f"the sound is {abs(late):.0f} frames {'early' if late > 0 else 'late'}; shift it in the video"
     ratio = float(np.median([clip.difference_ratio for clip in clips]))
     if ratio > NOISY_BROWS:
         yield f"the motion of the brows is mostly noise (difference ratio {ratio:.2f})"

@@ -24,8 +24,17 @@ SHA256 = "64184e229b263107bc2b804c6625db1341ff2bb731874b0bcc2fe6544e0bc9ff"
 LICENCE = "Apache-2.0"
 POINTS = 468
 """Vertices of the canonical face; five points of each iris follow them in the landmarks."""
-OBTAIN = f"download {URL} (3.8 MB, Apache-2.0) and give it as --model, or in the environment variable {VARIABLE}"
-MEMBERS = ("face_detector.tflite", "face_landmarks_detector.tflite", "geometry_pipeline_metadata_landmarks.binarypb")
+OBTAIN = (
+    f"download {URL} (3.8 MB, Apache-2.0, SHA-256 {SHA256}) and give it as --model, or in the environment variable "
+    f"{VARIABLE}"
+)
+DETECTOR, LANDMARKER = "face_detector.tflite", "face_landmarks_detector.tflite"
+GEOMETRY = "geometry_pipeline_metadata_landmarks.binarypb"
+SHAPES: dict[str, list[tuple[int, ...]]] = {
+    DETECTOR: [(1, 128, 128, 3), (1, 896, 16), (1, 896, 1)],
+    LANDMARKER: [(1, 256, 256, 3), (1, 1, 1, 1434), (1, 1, 1, 1), (1, 1)],
+}
+"""Of the image and the outputs of the networks."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +64,19 @@ def read_face_model(path: Path | None) -> FaceModel:
         raise FaceDiffError(f"{path or '--model'}: no face model; {OBTAIN}")
     try:
         with zipfile.ZipFile(path) as archive:
-            detector, landmarker, geometry = map(archive.read, MEMBERS)
-        canonical, triangles, weights = read_geometry(geometry)
-        graphs = Converter(detector).convert(), Converter(landmarker).convert()
+            graphs = [network(archive, name) for name in SHAPES]
+            canonical, triangles, weights = read_geometry(archive.read(GEOMETRY))
     except (zipfile.BadZipFile, LookupError, ValueError, StopIteration, struct.error) as error:
         raise FaceDiffError(f"{path}: is not the face landmarker that was expected ({error}); {OBTAIN}") from error
     return FaceModel(*graphs, canonical, triangles, weights, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def network(archive: zipfile.ZipFile, name: str) -> bytes:
+    """The graph of a network of the file."""
+    converter = Converter(archive.read(name))
+    if converter.shapes_of_ends != SHAPES[name]:
+        raise ValueError(f"{name}: image and outputs of {converter.shapes_of_ends}")
+    return converter.convert()
 
 
 def session(graph: bytes) -> Any:  # noqa: ANN401 - ONNX Runtime has no types

@@ -113,6 +113,11 @@ class Converter:
         self.nodes: list[Any] = []
         self.weights: list[Any] = []
 
+    @property
+    def shapes_of_ends(self) -> list[tuple[int, ...]]:
+        """Of the image, and of the outputs in the order of the file."""
+        return [self.shapes[number] for number in (*self.graph.numbers(1), *self.graph.numbers(2))]
+
     def convert(self) -> bytes:
         """The graph; its input is an image (1, height, width, 3), its outputs are in the order of the file."""
         helper = self.onnx.helper

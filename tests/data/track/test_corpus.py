@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-import facediff
 from facediff.cli.app import main
-from facediff.cli.track import with_tracked_styles
 from facediff.data import People
 from facediff.data.corpus import read_clip_table, read_templates
-from facediff.data.track.topology import LIP_PAIRS
+from facediff.data.track.topology import BROWS, LIP_PAIRS
 from facediff.mesh.mesh_files import read_mesh
-from tests.fakes.people import Look, talking, use_coded_faces, write_coded_video, write_people
+from tests.fakes.people import CodedTracker, Look, talking, use_coded_faces, write_coded_video, write_people
 
 
 @pytest.fixture(autouse=True)
@@ -124,6 +122,51 @@ def test_videos_that_cannot_be_used(
     assert problem in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("looks", "options", "warning"),
+    [
+        ([Look(0.5 + 0.4 * look.gap) for look in talking(4)], {}, "the mouth is open in more than 90 % of the frames"),
+        (talking(4, scale=0.25), {}, "; from 80 on it is exact"),
+        (talking(4), {"times": np.arange(100) / 20}, "20.0 frames a second; closures of 60 ms are missed"),
+        ([look for look in talking(2) for _ in range(2)], {}, "pictures are repeated; use the recording before"),
+        (talking(4), {}, "a person's only clip belongs to no split"),
+        (talking(4), {}, "the face model has SHA-256 000"),
+    ],
+)
+def test_videos_that_are_worse_than_they_could_be(
+    tmp_path: Path, looks: list[Look], options: dict[str, Any], warning: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert track(write_coded_video(tmp_path / "eva.mp4", pictures(looks), **options), tmp_path / "people") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [warning in line for line in lines if line.startswith("warning: ")].count(True) == 1
+
+
+def test_a_good_video_has_no_warnings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("facediff.data.track.corpus.SHA256", "0" * 64)
+    looks = [Look(0.5 + 0.5 * float(gap)) for gap in np.sin(np.arange(200))]
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(looks))
+    assert track(video, tmp_path / "people", "--clip-seconds", "2") == 0
+    assert "warning" not in capsys.readouterr().out
+
+
+def test_noise_of_the_brows_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random, still = np.random.default_rng(0), CodedTracker.landmarks
+
+    def trembling(tracker: CodedTracker, picture: np.ndarray) -> tuple[np.ndarray, float] | None:
+        found = still(tracker, picture)
+        assert found is not None
+        found[0][list(BROWS)] += random.normal(0, 1, (len(BROWS), 3))
+        return found
+
+    monkeypatch.setattr(CodedTracker, "landmarks", trembling)
+    assert track(write_coded_video(tmp_path / "eva.mp4", pictures(talking(4))), tmp_path / "people") == 0
+    assert "the motion of the brows is mostly noise (difference ratio 1.7" in capsys.readouterr().out
+
+
 def test_one_of_several_faces_is_chosen(tmp_path: Path) -> None:
     video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(4, faces=2)))
     assert track(video, tmp_path / "people", "--face", "left") == 0
@@ -200,20 +243,6 @@ def test_a_video_joins_a_corpus_of_people(tmp_path: Path, capsys: pytest.Capture
     assert main(["data", "check", str(entry), "--quick", "--quiet"]) == 0
     capsys.readouterr()
     assert main(["data", "import-person", str(tmp_path / "m.npy"), "--name", "e", "--corpus", "x", "-o", "y"]) == 2
-
-
-def test_a_video_gives_a_style_on_the_models_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(3)))
-    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
-    model = SimpleNamespace(identities=["ada"], corpus="people", n_vertices=468)
-    monkeypatch.setattr("facediff.load", lambda checkpoint: model)
-    words = with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt")
-    file, weight = words.split(",")[0].rsplit(":", 1)
-    motion = facediff.read(file)
-    assert (motion.vertices.shape[1:], motion.name, weight) == ((468, 3), "style_s001", "0.5")
-    assert with_tracked_styles("F1_e05", "model.ckpt") == "F1_e05"
-    monkeypatch.setattr("facediff.data.track.corpus.track_people", None)  # the second time nothing is tracked
-    assert with_tracked_styles(f"{video}:0.5,other:0.5", "model.ckpt") == words
 
 
 def test_an_unseen_persons_only_clip_stops_no_test(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
