@@ -18,9 +18,9 @@ from facediff.version import __version__ as __version__
 if TYPE_CHECKING:
     from facediff import metrics as metrics
     from facediff.animation.animation import Animation as Animation
-    from facediff.editing.direction import Direction as Direction
-    from facediff.editing.direction import Key as Key
-    from facediff.editing.direction import read_direction as read_direction
+    from facediff.editing.controls.direction import Direction as Direction
+    from facediff.editing.controls.direction import Key as Key
+    from facediff.editing.controls.direction import read_direction as read_direction
     from facediff.errors import FaceDiffError as FaceDiffError
     from facediff.pipelines.animator import Animator as Animator
     from facediff.pipelines.animator import import_checkpoint as import_checkpoint
@@ -32,7 +32,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "animation.animation": "Animation",
-        "editing.direction": "Direction Key read_direction",
+        "editing.controls.direction": "Direction Key read_direction",
         "errors": "FaceDiffError",
         "pipelines.animator": "Animator import_checkpoint load",
         "pipelines.motion": "read view",

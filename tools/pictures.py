@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT))
 from facediff.animation import Animation, read_archive  # noqa: E402
 from facediff.cli.demo import write_sheet  # noqa: E402
 from facediff.data import Puppet  # noqa: E402
-from facediff.editing.direction import Direction, Key  # noqa: E402
+from facediff.editing.controls.direction import Direction, Key  # noqa: E402
 from facediff.export import ExportOptions  # noqa: E402
 from facediff.export.video import drawn_frames  # noqa: E402
 from facediff.render import contact_sheet, save_image  # noqa: E402

@@ -64,7 +64,7 @@ def export(
     read = SourceReader(source).read
     motions: list[Animation] = [read(path) for path in animations]
     if not controls.is_off:
-        from facediff.editing.controlled import apply_controls
+        from facediff.editing.controls.controlled_face import apply_controls
 
         motions = [apply_controls(animation, controls) for animation in motions]
     for written in write_animations(output, with_different_names(motions, animations), options):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from facediff.animation import Animation
 
 Acted = npt.NDArray[np.float64]
-"""Values of the channels :data:`facediff.editing.controlled.ACTED` in each frame, (T, 5)."""
+"""Values of the channels :data:`facediff.editing.controls.controlled_face.ACTED` in each frame, (T, 5)."""
 
 Strength = Annotated[float, Range(0, 2)]
 Degrees = Annotated[float, Range(0, 10)]
@@ -162,7 +162,7 @@ BLINKS_APART = 1.0
 SET_IN = 0.4  # Seconds before and after speech in which the drift sets in and dies down
 WAVES = (0.13, 0.21, 0.34)  # Hertz of the drift, far below the rhythm of syllables
 DRIFTS = (0.4, 1.0, 0.6)  # How much of it is nodding, turning and tilting
-STREAM = 4  # of random numbers, next to those of facediff.editing.procedural
+STREAM = 4  # of random numbers, next to those of facediff.editing.controls.procedural
 
 
 def smoother_step(t: float) -> float:

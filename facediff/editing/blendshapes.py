@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.bounded import Problem, minimise, minimise_sparse
-from facediff.editing.expressiveness import ALL, check_factors
+from facediff.editing.controls.expressiveness import ALL, check_factors
 from facediff.editing.shapes import BUILT_IN, ShapeSet, read_shapes
 from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.mesh.mesh import triangle_areas

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from facediff.editing.eyelids import MEET
+from facediff.editing.controls.eyelids import MEET
 from facediff.editing.face_features import LIDS, SAMPLES, Features, FrontView, Opening
 from facediff.editing.surface import Surface
 from facediff.utils.numerics import smooth_step

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from facediff.animation import Animation
-from facediff.editing.procedural import move_head
+from facediff.editing.controls.procedural import move_head
 from facediff.errors import FaceDiffError
 from facediff.spaces.arkit import arkit_name
 from facediff.spaces.decoding import ChannelDecoder

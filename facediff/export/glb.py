@@ -17,7 +17,7 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.animation import stretches_of
 from facediff.animation.options import ExportOptions
-from facediff.editing.eyelids import puppet_eyes
+from facediff.editing.controls.eyelids import puppet_eyes
 from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
 from facediff.export.glb_writer import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbWriter
 from facediff.export.motion_shapes import BLOCK, Array, Morphs, compress, compress_long

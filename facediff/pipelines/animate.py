@@ -21,7 +21,6 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.animation.options import AnimationOptions, ExportOptions, Scales, scales_text
-from facediff.editing.blendshapes import is_built_in_face
 from facediff.editing.controls import check_controls, is_procedural, keys_file, keys_of
 from facediff.errors import OptionError, refuse_idle
 from facediff.pipelines.stages import (
@@ -49,7 +48,7 @@ from facediff.utils.ranges import USUAL_GAZE, USUAL_SWAY
 from facediff.version import __version__
 
 if TYPE_CHECKING:
-    from facediff.editing.direction import Direction
+    from facediff.editing.controls.direction import Direction
     from facediff.spaces.decoding import ChannelDecoder
     from facediff.speech.audio import SpeechRecording
     from facediff.speech.windows import WindowPlan
@@ -97,7 +96,7 @@ def enlivened(options: AnimationOptions) -> AnimationOptions:
     if keys_file(options.direction) is not None:
         return options
     keys = keys_of(options.direction)
-    usual = {"acting": "prosody", "sway": USUAL_SWAY, "gaze": USUAL_GAZE}
+    usual: dict[str, Any] = {"acting": "prosody", "sway": USUAL_SWAY, "gaze": USUAL_GAZE}
     free = [name for name in usual if getattr(options, name) is None and (keys is None or not keys.under(name))]
     return replace(options, **{name: usual[name] for name in free})
 
@@ -106,7 +105,7 @@ def expressivity_of(options: AnimationOptions) -> dict[str, float]:
     """Expressivity by region; ``all`` stands for every vertex that no other name covers. Empty for the model's own."""
     if options.expressivity is None:
         return {}
-    from facediff.editing.expressiveness import read_factors
+    from facediff.editing.controls.expressiveness import read_factors
 
     return read_factors(options.expressivity, "expressivity", ranges.EXPRESSIVITY.most)
 
@@ -151,9 +150,9 @@ class AnimationPipeline(ABC):
         rest_weights: Callable[[], Array],
         decoder: ChannelDecoder | None = None,
     ) -> None:
-        if options.alive and decoder is None and is_built_in_face(len(face["template"]), face.get("faces")):
-            options = enlivened(options)
         self.options, self.facts, self.windows = options, face, windows
+        if options.alive and decoder is None and self.is_built_in:
+            self.options = options = enlivened(options)
         self.frame_rate: float = face["frame_rate"]
         self.windows.in_frames(self.frame_rate)
         draws_controls = is_procedural(options) and options.controls_seed is None
@@ -239,8 +238,14 @@ class AnimationPipeline(ABC):
         """Whether animations have weights of ARKit's shapes, or are of the built-in face, which has such shapes."""
         if self.decoder is not None and self.decoder.space.kind == "arkit":
             return True
-        faces = self.facts.get("faces")
-        return self.options.target_mesh is None and is_built_in_face(len(self.facts["template"]), faces)
+        return self.options.target_mesh is None and self.is_built_in
+
+    @property
+    def is_built_in(self) -> bool:
+        """Whether the model's face is the built-in one."""
+        from facediff.editing.blendshapes import is_built_in_face
+
+        return is_built_in_face(len(self.facts["template"]), self.facts.get("faces"))
 
     @property
     @abstractmethod
@@ -253,7 +258,7 @@ class AnimationPipeline(ABC):
         self.face = None
         face_direction = None if direction is None else direction.without_model_channels()
         if face_direction is not None or not self.options.without_keys.is_off:
-            from facediff.editing.controlled import ControlledFace
+            from facediff.editing.controls.controlled_face import ControlledFace
 
             face = self.facts
             self.face = ControlledFace(

@@ -29,7 +29,7 @@ from facediff.utils.licences import Licence, licence_metadata, require_cleared
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.editing.direction import Direction
+    from facediff.editing.controls.direction import Direction
 
 FRAME_RATE = 30.0
 """Frames a second by default; any rate will do."""

@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facediff.editing.direction import Direction, Key, curve, text_shares
-from facediff.editing.expressiveness import ALL, region_weights
+from facediff.editing.controls.direction import Direction, Key, curve, text_shares
+from facediff.editing.controls.expressiveness import ALL, region_weights
 from facediff.errors import FaceDiffError, located
 from facediff.models.inference import Progress, SpeechStream
 from facediff.models.styles import style_from
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from facediff.data import Reference
-    from facediff.editing.eyelids import Array
+    from facediff.editing.controls.eyelids import Array
     from facediff.models import AnimationModel, Style
 
 MOST_RUNS = 32

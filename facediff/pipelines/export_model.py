@@ -278,7 +278,7 @@ def arrays_of(
     model: AnimationModel, graphs: Graphs, faces: list[str], extra_styles: Mapping[str, Style]
 ) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
     """What ``arrays.npz`` holds for these faces, and the names of its styles."""
-    from facediff.editing.expressiveness import rest_weights
+    from facediff.editing.controls.expressiveness import rest_weights
     from facediff.models.styles import vector_of
     from facediff.pipelines.trained import facts_of, with_rig
 

@@ -16,7 +16,7 @@ from facediff.utils.files import valid_text
 from facediff.utils.hub import model_name
 
 if TYPE_CHECKING:
-    from facediff.editing.direction import Direction
+    from facediff.editing.controls.direction import Direction
     from facediff.pipelines.stages import Array
 
 FIXED = ("sampler", "steps", "guidance", "style_template", "precision", "device")

@@ -120,7 +120,7 @@ def _in_words(value: object) -> str:
 
 def check_directions(options: AnimationOptions, recordings: Sequence[Path], folder: Path) -> None:
     """Read the keys of every recording, and say which recordings have none."""
-    from facediff.editing.direction import direction_file
+    from facediff.editing.controls.direction import direction_file
 
     files = {recording: direction_file(folder, recording) for recording in recordings}
     without = [recording.name for recording, file in files.items() if file is None]
@@ -145,7 +145,7 @@ def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
     """The files that decide one recording's animation alone: its keys over time."""
     if (folder := directions_folder(options)) is None:
         return []
-    from facediff.editing.direction import direction_file
+    from facediff.editing.controls.direction import direction_file
 
     file = direction_file(folder, recording)
     return [] if file is None else [file]
@@ -204,7 +204,7 @@ def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: l
     def animate(recording: Path, output: Path) -> list[Path]:
         speech = read_recording(recording, options.max_seconds)
         if has_directions:
-            from facediff.editing.direction import read_direction
+            from facediff.editing.controls.direction import read_direction
 
             file = next(iter(_own_files(options, recording)), None)
             pipeline.direct(None if file is None else read_direction(file, pipeline.frame_rate))

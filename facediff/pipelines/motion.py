@@ -61,8 +61,8 @@ def compare(
 
 def control(animation: Animation, controls: AnimationControls) -> Animation:
     """An animation with controls applied: :meth:`Animation.control`."""
-    from facediff.editing.controlled import apply_controls
     from facediff.editing.controls import check_controls
+    from facediff.editing.controls.controlled_face import apply_controls
 
     check_controls(controls)
     return apply_controls(animation, controls)

@@ -41,7 +41,7 @@ from facediff.utils.arrays import ArrayWriter, open_array
 
 if TYPE_CHECKING:
     from facediff.editing.acting import Acting
-    from facediff.editing.controlled import Amounts, ControlledFace
+    from facediff.editing.controls.controlled_face import Amounts, ControlledFace
     from facediff.editing.correspondence import Correspondence
     from facediff.editing.fit_check import FitReport
     from facediff.spaces.decoding import ChannelDecoder
@@ -441,7 +441,7 @@ class CloseLips(Stage):
     def whole(self, take: Take) -> None:
         """Learn from all frames how the face opens its mouth, and close it."""
         from facediff.animation.animation import PHONEMES
-        from facediff.editing.closures import BUDGET, close_lips
+        from facediff.editing.controls.closures import BUDGET, close_lips
         from facediff.speech.phonemes import closed_times, phonemes_text
 
         phonemes = self.phonemes(take.recording.speech)
@@ -459,7 +459,7 @@ class Direct(Stage):
 
     def apply(self, stretch: Stretch, amounts: Amounts | None) -> Stretch:
         """Frames with the amounts of them; None where nothing is controlled."""
-        from facediff.editing.procedural import move_head, moves_head
+        from facediff.editing.controls.procedural import move_head, moves_head
 
         animation, turns = stretch.animation, stretch.turns
         assert animation is not None  # noqa: S101 - decoded

@@ -27,7 +27,7 @@ from facediff.utils.licences import licence_metadata
 
 if TYPE_CHECKING:
     from facediff.data import Assets, Reference
-    from facediff.editing.direction import Direction
+    from facediff.editing.controls.direction import Direction
     from facediff.models import AnimationModel, Style
     from facediff.pipelines.directing import DirectedStream
     from facediff.pipelines.stages import Array
@@ -92,7 +92,7 @@ class TrainedPipeline(AnimationPipeline):
             self.style = style_from(options.style, self.identity, model, template=options.style_template)
 
         def rest_weights() -> Array:
-            from facediff.editing.expressiveness import rest_weights
+            from facediff.editing.controls.expressiveness import rest_weights
 
             return rest_weights(face["template"], face["regions"])
 
@@ -207,7 +207,7 @@ class TrainedPipeline(AnimationPipeline):
 
     def _choose_expressivity(self) -> None:
         """Take over the options' expressivity, which may differ between the face's regions."""
-        from facediff.editing.expressiveness import ALL, region_factors
+        from facediff.editing.controls.expressiveness import ALL, region_factors
 
         factors, name = expressivity_of(self.options), type(self.model).__name__
         if not self.model.samples:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facediff.editing.acting import Acting, acted, gesture, read_acting
-from facediff.editing.controlled import ACTED
+from facediff.editing.controls.controlled_face import ACTED
 from tests.speech.test_prosody import RATE, SECONDS, SILENCE, voice
 
 FRAMES = 100

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
-from facediff.editing.procedural import move_head
+from facediff.editing.controls.procedural import move_head
 from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.export.glb_own_shapes import drive_avatar, own_shapes

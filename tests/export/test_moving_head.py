@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from facediff.animation import Animation, read_archive
 from facediff.animation.options import AnimationControls
-from facediff.editing.controlled import apply_controls
-from facediff.editing.direction import Direction, Key
+from facediff.editing.controls.controlled_face import apply_controls
+from facediff.editing.controls.direction import Direction, Key
 from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
 from facediff.spaces.files import read_parameters

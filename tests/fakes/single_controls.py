@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.expressiveness import expressiveness_words, scaled_regions
-from facediff.editing.eyelids import Eyes
-from facediff.editing.procedural import (
+from facediff.editing.controls.expressiveness import expressiveness_words, scaled_regions
+from facediff.editing.controls.eyelids import Eyes
+from facediff.editing.controls.procedural import (
     DEGREES_GAZE,
     DEGREES_SWAY,
     EDITED,

@@ -17,9 +17,9 @@ import facediff
 from facediff.animation import read_archive
 from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
-from facediff.editing.direction import CHANNELS, METADATA, Direction, Key, read_direction, text_shares
-from facediff.editing.expressiveness import region_factors
-from facediff.editing.eyelids import puppet_eyes
+from facediff.editing.controls.direction import CHANNELS, METADATA, Direction, Key, read_direction, text_shares
+from facediff.editing.controls.expressiveness import region_factors
+from facediff.editing.controls.eyelids import puppet_eyes
 from facediff.errors import FaceDiffError
 from facediff.pipelines.folder import animate_folder
 from facediff.speech.audio import read_speech

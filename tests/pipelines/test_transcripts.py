@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import facediff
-from facediff.editing.closures import close_lips
+from facediff.editing.controls.closures import close_lips
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import closed_times, read_phonemes

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from facediff.cli.app import main
-from facediff.editing.brows import brows_of
-from facediff.editing.eyelids import puppet_eyes
+from facediff.editing.controls.brows import brows_of
+from facediff.editing.controls.eyelids import puppet_eyes
 from facediff.editing.landmarks import NAMES, known_topology, puppet_landmarks
 from facediff.editing.shapes import read_shapes
 from facediff.spaces.arkit import ALPHABETICAL

@@ -17,10 +17,10 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.archives import FORMAT as ARCHIVE
 from facediff.animation.options import ExportOptions
-from facediff.editing import direction
 from facediff.editing.acting import speech_16k
-from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.procedural import neck
+from facediff.editing.controls import direction
+from facediff.editing.controls.expressiveness import ALL, region_factors
+from facediff.editing.controls.procedural import neck
 from facediff.errors import FaceDiffError
 from facediff.export.format import Format, check_animation, outward, speech_wav
 from facediff.export.viewer.channels import channel_facts

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import PHONEMES
-from facediff.editing import direction, procedural
-from facediff.editing.brows import brows_of
-from facediff.editing.controlled import ACTED
-from facediff.editing.eyelids import puppet_eyes
-from facediff.editing.face_shapes import own_shapes
+from facediff.editing.controls import direction, procedural
+from facediff.editing.controls.brows import brows_of
+from facediff.editing.controls.controlled_face import ACTED
+from facediff.editing.controls.eyelids import puppet_eyes
+from facediff.editing.controls.face_shapes import own_shapes
 from facediff.errors import FaceDiffError
 from facediff.export.viewer.packing import Blobs, millimetres
 from facediff.utils.plain_files import parse_json
@@ -24,7 +24,7 @@ FIELD_STEP = 0.01
 """Quantisation of displacements in mm: a vertex is off by less than 0.01 mm at a weight of 1."""
 ACTING = re.compile(r"brow and head acting \((.+), seed ([0-9]+)\)")
 BLINKS = re.compile(r"blinks \(([0-9.]+) a minute, seed ([0-9]+)\)")
-"""How :mod:`facediff.editing.controlled` and :func:`~facediff.editing.procedural.blink_words` name them in metadata."""
+"""How the controls name them in metadata, such as :func:`~facediff.editing.controls.procedural.blink_words`."""
 
 
 def pose_fields(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ import pytest
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
 from facediff.editing.blendshapes import solve
-from facediff.editing.procedural import move_head
+from facediff.editing.controls.procedural import move_head
 from facediff.editing.shapes import read_shapes
 from facediff.export import pictures
 from facediff.mesh import read_mesh

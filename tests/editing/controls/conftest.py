@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.eyelids import Eyes
+from facediff.editing.controls.eyelids import Eyes
 from facediff.synthetic.corpus import region_vertices
 from facediff.synthetic.head.parts import build_head
 from facediff.synthetic.known_faces import built_in_rig

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.eyelids import Eyes
-from facediff.editing.procedural import blink_curve
+from facediff.editing.controls.eyelids import Eyes
+from facediff.editing.controls.procedural import blink_curve
 from facediff.synthetic.head.parts import build_head
 from tests.fakes.single_controls import add_blinks
 

@@ -12,9 +12,9 @@ import trimesh
 
 from facediff.animation import Animation
 from facediff.animation.options import AnimationControls
-from facediff.editing.brows import brows_of
-from facediff.editing.controlled import apply_controls
-from facediff.editing.direction import Direction, Key
+from facediff.editing.controls.brows import brows_of
+from facediff.editing.controls.controlled_face import apply_controls
+from facediff.editing.controls.direction import Direction, Key
 from facediff.errors import FaceDiffError
 from tests.fakes.small_face import CONTROLS, F1, build_face, build_rig
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.expressiveness import FALL_OFF, region_factors
-from facediff.editing.eyelids import Eyes
+from facediff.editing.controls.expressiveness import FALL_OFF, region_factors
+from facediff.editing.controls.eyelids import Eyes
 from tests.fakes.single_controls import scale_regions
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.eyelids import Eyes
-from facediff.editing.procedural import (
+from facediff.editing.controls.eyelids import Eyes
+from facediff.editing.controls.procedural import (
     gaze_curve,
     gaze_rotations,
     sphere_centre,

@@ -10,7 +10,7 @@ import trimesh
 
 from facediff.animation import Animation, read_archive, write_archive
 from facediff.cli.app import main
-from facediff.editing.procedural import move_head
+from facediff.editing.controls.procedural import move_head
 from facediff.editing.retargeting import retarget
 from facediff.mesh.glb import open_glb
 from facediff.render import Look

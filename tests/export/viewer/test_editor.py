@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation, read_archive
-from facediff.editing.direction import METADATA, STEP_SECONDS, Direction, Key, curve, read_direction
+from facediff.editing.controls.direction import METADATA, STEP_SECONDS, Direction, Key, curve, read_direction
 from facediff.errors import FaceDiffError
 from facediff.export.format import linear_colours
 from facediff.speech.phonemes import TimedPhoneme, phonemes_text

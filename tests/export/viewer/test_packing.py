@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facediff.animation import Animation
-from facediff.editing.direction import METADATA, Direction, Key, channel_of
-from facediff.editing.expressiveness import region_factors
+from facediff.editing.controls.direction import METADATA, Direction, Key, channel_of
+from facediff.editing.controls.expressiveness import region_factors
 from facediff.errors import FaceDiffError
 from facediff.export.viewer import write_page
 from facediff.render.panels import heat_ramp

@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch import Trainer
 
 from facediff.data import Assets, Sample, collate
-from facediff.editing.direction import Direction
+from facediff.editing.controls.direction import Direction
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, load_model
 from facediff.models.adaptation import with_extra_identities

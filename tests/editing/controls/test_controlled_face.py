@@ -14,10 +14,10 @@ import pytest
 from facediff.animation import Animation
 from facediff.animation.options import AnimationControls
 from facediff.cli.parsing import parameters_of, parse
-from facediff.editing.controlled import apply_controls
 from facediff.editing.controls import check_controls
-from facediff.editing.direction import MOODS, Direction, Key, read_direction
-from facediff.editing.eyelids import Eyes
+from facediff.editing.controls.controlled_face import apply_controls
+from facediff.editing.controls.direction import MOODS, Direction, Key, read_direction
+from facediff.editing.controls.eyelids import Eyes
 from facediff.errors import FaceDiffError
 from facediff.synthetic.known_faces import built_in_rig
 from tests.fakes.single_controls import add_blinks, add_gaze, add_sway, scale_regions

@@ -30,7 +30,7 @@ def shapes_of(
     fields = own_shapes(template, faces)
     if fields is not None:
         return {name: fields[name] / np.float32(metres_per_unit(unit)) for name in names}
-    from facediff.editing.brows import carried
+    from facediff.editing.controls.brows import carried
     from facediff.synthetic.known_faces import built_in_rig
 
     rig = built_in_rig("F1")

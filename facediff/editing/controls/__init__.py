@@ -11,7 +11,7 @@ from facediff.utils.limits import FRAME_RATES
 
 # What edits an animation is imported where it is asked for: most animations have no controls.
 if TYPE_CHECKING:
-    from facediff.editing.direction import Direction
+    from facediff.editing.controls.direction import Direction
 
 
 UNCHECKED = FRAME_RATES[1]
@@ -21,7 +21,7 @@ UNCHECKED = FRAME_RATES[1]
 def check_controls(controls: AnimationControls) -> None:
     """Refuse animation controls that contradict each other, and files that do not exist."""
     if controls.expressiveness is not None:
-        from facediff.editing.expressiveness import read_factors
+        from facediff.editing.controls.expressiveness import read_factors
 
         read_factors(controls.expressiveness)
     for option, path, expected in (
@@ -47,7 +47,7 @@ def keys_file(direction: DirectionLike | None) -> Path | None:
     """The file or folder of keys over time; None where the keys themselves or a mood were given."""
     if not isinstance(direction, str | Path):
         return None
-    from facediff.editing.direction import is_mood
+    from facediff.editing.controls.direction import is_mood
 
     return None if is_mood(direction) else Path(direction)
 
@@ -63,7 +63,7 @@ def direction_for(direction: DirectionLike, recording: Path) -> DirectionLike:
     folder = keys_file(direction)
     if folder is None or not folder.is_dir():
         return direction
-    from facediff.editing.direction import direction_file
+    from facediff.editing.controls.direction import direction_file
 
     if (file := direction_file(folder, recording)) is None:
         raise OptionError(
@@ -76,12 +76,12 @@ def keys_of(direction: DirectionLike | None, frame_rate: float | None = None) ->
     """The keys over time; None if there are none, or each recording of a folder has its own.
 
     Args:
-        direction: a file, a :class:`~facediff.editing.direction.Direction`, or the rows of one.
+        direction: a file, a :class:`~facediff.editing.controls.direction.Direction`, or the rows of one.
         frame_rate: of frames and timecodes, where the keys do not say it; not checked yet if None.
     """
     if direction is None:
         return None
-    from facediff.editing.direction import Direction, read_direction
+    from facediff.editing.controls.direction import Direction, read_direction
 
     if isinstance(direction, str | Path):
         if Path(direction).is_dir():

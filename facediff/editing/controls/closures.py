@@ -8,9 +8,9 @@ import numpy as np
 
 from facediff.animation import Animation
 from facediff.animation.animation import measured, metres_per_unit
-from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.eyelids import Array
-from facediff.editing.procedural import EDITED, copied, with_metadata
+from facediff.editing.controls.expressiveness import ALL, region_factors
+from facediff.editing.controls.eyelids import Array
+from facediff.editing.controls.procedural import EDITED, copied, with_metadata
 from facediff.errors import FaceDiffError
 from facediff.utils.numerics import smooth_step
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.animation import allocate_like
 from facediff.animation.options import Scales, scales_text
-from facediff.editing.eyelids import Array, Eyes, Indices
-from facediff.editing.procedural import in_words
+from facediff.editing.controls.eyelids import Array, Eyes, Indices
+from facediff.editing.controls.procedural import in_words
 from facediff.errors import OptionError, check_known
 from facediff.utils.hints import Range, read
 from facediff.utils.numerics import nearest_distances, smooth_step

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import allocate_like
-from facediff.editing.eyelids import Array, Eyes
+from facediff.editing.controls.eyelids import Array, Eyes
 from facediff.mesh.flame import rotations
 from facediff.utils import ranges
 from facediff.utils.numerics import smooth_step

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.closures import RAMP, close_lips, closure_weights
+from facediff.editing.controls.closures import RAMP, close_lips, closure_weights
 
 CLOSURES = [(0.96, 1.08), (2.0, 2.04)]
 

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import metres_per_unit
-from facediff.editing.expressiveness import ALL, region_factors
-from facediff.editing.eyelids import Array, Eyes
-from facediff.editing.procedural import copied
+from facediff.editing.controls.expressiveness import ALL, region_factors
+from facediff.editing.controls.eyelids import Array, Eyes
+from facediff.editing.controls.procedural import copied
 from facediff.errors import OptionError
 
 REGION = "brows"

@@ -16,18 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing import procedural
-from facediff.editing.controls import keys_of, refuse_folder
-from facediff.editing.direction import METADATA, Direction, channel_of, curve, direction_of
-from facediff.editing.expressiveness import expressiveness_words, scaled_regions
-from facediff.editing.eyelids import GIVE, Array, Eyes, eyes_for
-from facediff.editing.procedural import EDITED, PROCEDURAL, Amount, with_metadata
+from facediff.editing.controls import keys_of, procedural, refuse_folder
+from facediff.editing.controls.direction import METADATA, Direction, channel_of, curve, direction_of
+from facediff.editing.controls.expressiveness import expressiveness_words, scaled_regions
+from facediff.editing.controls.eyelids import GIVE, Array, Eyes, eyes_for
+from facediff.editing.controls.procedural import EDITED, PROCEDURAL, Amount, with_metadata
 from facediff.errors import FaceDiffError, OptionError
 
 if TYPE_CHECKING:
     from facediff.animation.options import AnimationControls
-    from facediff.editing.brows import Brows
-    from facediff.editing.face_shapes import Fields
+    from facediff.editing.controls.brows import Brows
+    from facediff.editing.controls.face_shapes import Fields
 
 HEAD = ("head.pitch", "head.yaw", "head.roll")
 ACTED = ("brows", "lids", *HEAD)
@@ -96,25 +95,25 @@ class ControlledFace:
         channels = {} if direction is None else direction.channels
         self.factors: dict[str, float] = {}
         if controls.expressiveness is not None:
-            from facediff.editing.expressiveness import read_factors
+            from facediff.editing.controls.expressiveness import read_factors
 
             self.factors = read_factors(controls.expressiveness)
         keyed = (channel.partition(".")[2] or "all" for channel in self._keys("expressiveness"))
         factors = [*self.factors, *keyed]
         if factors:
-            from facediff.editing.expressiveness import check_factors
+            from facediff.editing.controls.expressiveness import check_factors
 
             check_factors(dict.fromkeys(factors, 1.0), regions, name)
         self.eyes = self._needed_eyes(template, faces)
         self.brows: Brows | None = None
         if controls.acting is not None or "brows" in channels:
-            from facediff.editing.brows import brows_of
+            from facediff.editing.controls.brows import brows_of
 
             self.brows = brows_of(template, faces, regions, unit, self.eyes)
 
         self.shapes: Fields = {}
         if shapes := [channel.partition(".")[2] for channel in self._keys("shape")]:
-            from facediff.editing.face_shapes import shapes_of
+            from facediff.editing.controls.face_shapes import shapes_of
 
             self.shapes = shapes_of(template, faces, unit, shapes)
 
@@ -239,11 +238,11 @@ class ControlledFace:
         if amounts.expressiveness:
             animation = with_vertices(scaled_regions(animation, amounts.expressiveness, eyes))
         if amounts.shapes:
-            from facediff.editing.face_shapes import add_shapes
+            from facediff.editing.controls.face_shapes import add_shapes
 
             animation = with_vertices(add_shapes(procedural.copied(animation.vertices), self.shapes, amounts.shapes))
         if self.brows is not None and amounts.brows is not None:
-            from facediff.editing.brows import raise_brows
+            from facediff.editing.controls.brows import raise_brows
 
             animation = with_vertices(raise_brows(animation, self.brows, amounts.brows))
         if amounts.gaze is not None and eyes is not None:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from facediff.editing.direction import STEP_SECONDS, Direction, Key, curve, read_direction, slopes, text_shares
+from facediff.editing.controls.direction import STEP_SECONDS, Direction, Key, curve, read_direction, slopes, text_shares
 from facediff.errors import FaceDiffError
 
 LARGER = "expressiveness"
