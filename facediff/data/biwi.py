@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import ClassVar
 
 from facediff import registry
@@ -58,6 +59,12 @@ class Biwi(SpeechMotionDataModule):
         """``F2_e01``; the neutral sequences (``F2_01``) are not used by the field."""
         match = re.fullmatch(r"([FM]\d)_(e\d\d)", name)
         return Clip(name, match[1], match[2]) if match else None
+
+    @classmethod
+    def name_attributes(cls, name: str) -> Mapping[str, str]:
+        """Of 80 sequences of a speaker, 40 are emotional (``F2_e01`` to ``F2_e40``) and 40 neutral (``F2_01`` …)."""
+        match = re.fullmatch(r"[FM]\d_(e?)\d\d", name)
+        return {} if match is None else {"emotion": "emotional" if match[1] else "neutral"}
 
     @classmethod
     def expected_clips(cls) -> dict[str, list[str]]:

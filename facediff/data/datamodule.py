@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -291,6 +291,12 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
     def parse_name(cls, name: str) -> Clip | None:
         """Identity and sentence of a clip's name; None for a file that is no clip of the corpus."""
         return parse_name(name)
+
+    @classmethod
+    def name_attributes(cls, name: str) -> Mapping[str, str]:
+        """The attributes that a clip's name holds, such as the emotion; empty for names of another form."""
+        clip = cls.parse_name(name)
+        return {} if clip is None else clip.attributes
 
     @classmethod
     def expected_clips(cls) -> dict[str, list[str]]:

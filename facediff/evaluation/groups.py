@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
+from facediff import registry
+from facediff.data import SpeechMotionDataModule
 from facediff.data.corpus import read_clip_table
 from facediff.errors import FaceDiffError, choices
-
-BIWI_NAME = re.compile(r"[FM]\d_(e?)\d\d")
-"""Of BIWI's 80 sequences of a speaker, 40 are emotional (e01 to e40) and 40 neutral (01 to 40)."""
 
 
 def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -18,8 +16,7 @@ def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]
 
     Args:
         corpus: the corpus folder; its ``clips.csv`` is read if there is one.
-        names: of the clips' files, without suffix. Those of 3DMEAD (``M003_001_4_1``: emotion, intensity) and of BIWI
-            (``F2_e37``, ``F2_37``: emotional or neutral) hold attributes.
+        names: of the clips' files, without suffix; those of some corpora hold attributes.
         by: which attributes.
     """
     table = {} if corpus is None else read_clip_table(corpus)
@@ -37,11 +34,6 @@ def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]
 
 
 def attributes_of_name(name: str) -> Mapping[str, str]:
-    """The attributes in a clip's name in 3DMEAD and BIWI."""
-    from facediff.data.mead3d import Mead3D
-
-    clip = Mead3D.parse_name(name)
-    if clip is not None:
-        return clip.attributes
-    biwi = BIWI_NAME.fullmatch(name)
-    return {} if biwi is None else {"emotion": "emotional" if biwi[1] else "neutral"}
+    """The attributes in a clip's name, by the first corpus with attributes in names of this form."""
+    modules: list[type[SpeechMotionDataModule]] = [entry.implementation for entry in registry.corpus]
+    return next(filter(None, (module.name_attributes(name) for module in modules)), {})
