@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import traceback
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -270,6 +271,15 @@ class MissingExtraError(FaceDiffError):
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str]]:
         """Pickling, by which worker processes hand errors over, must not call the class with the message alone."""
         return type(self), self.arguments
+
+
+class Note(UserWarning):
+    """A remark on an input that is read otherwise than its user may expect; the command line prints it as a note."""
+
+
+def note(text: object) -> None:
+    """Say a :class:`Note`, once a text."""
+    warnings.warn(printable(text), Note, stacklevel=3)
 
 
 @contextmanager

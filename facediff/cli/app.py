@@ -251,7 +251,10 @@ def run(name: str, arguments: Sequence[str]) -> int:
     from facediff.utils.output_paths import reading
 
     function = load(name)
-    with reading():  # files that the parser takes as inputs are not overwritten until the command has ended
+    with (
+        process.notes(),
+        reading(),
+    ):  # files that the parser takes as inputs are not overwritten until the command has ended
         if function.__name__ in ("run", "lightning"):  # it has a parser of its own
             return int(function(name, arguments) or 0)
         from facediff.cli.parsing import arguments_of

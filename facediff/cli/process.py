@@ -11,14 +11,15 @@ import io
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
 import facediff
-from facediff.errors import FaceDiffError, printable
+from facediff.errors import FaceDiffError, Note, printable
 
 USAGE, FAULT, INTERRUPTED, READER_GONE = 2, 70, 130, 141
 """Exit statuses in addition to 0 and to 1, which means that a part of the work failed; see docs/command_line.md."""
@@ -104,6 +105,23 @@ def tell(*lines: object) -> None:
     for line in lines:
         print(printable(line).encode(encoding, errors="backslashreplace").decode(encoding))
     sys.stdout.flush()
+
+
+@contextmanager
+def notes() -> Iterator[None]:
+    """A context in which notes of the library are lines on standard error, once each."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", Note)
+        standard = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:  # noqa: ANN401
+            if issubclass(category, Note):
+                print(f"note: {message}", file=sys.stderr, flush=True)
+            else:
+                standard(message, category, *place, **more)
+
+        warnings.showwarning = show
+        yield
 
 
 def confirm_cost(yes: bool, lower: str, *, seconds: float = 0.0, size: float = 0.0) -> None:

@@ -8,22 +8,25 @@ and whether a file is whole. Nothing here needs PyTorch.
 from __future__ import annotations
 
 import io
+import math
 import mmap
 import numbers
-import os
+import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import chain
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, OptionError, needs_extra, refuse_idle
+from facediff.errors import FaceDiffError, MissingExtraError, OptionError, needs_extra, note, refuse_idle
 from facediff.speech.pcm import samples_of
+from facediff.speech.voice_activity import NOISY, loudness_range
 from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.hints import check_number
@@ -37,22 +40,42 @@ if TYPE_CHECKING:
         str | Path | IO[bytes] | Mapping[str, Any] | Waveform | tuple[Waveform, int] | tuple[int, Waveform]
     )
 
+Samples = npt.NDArray[np.float32]
+
 SUFFIXES = (".wav", ".flac", ".ogg", ".mp3", ".opus", ".aiff")
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".flv", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".3gp")
 CONTAINERS = (*VIDEOS, ".m4a", ".aac")
 """Videos and similar containers; PyAV extracts their sound."""
 
-DEMUXERS = "flv,mov,mp4,m4a,matroska,webm,avi,aac,mpegts,mpeg,mp3,ogg,wav,flac,aiff,w64,caf"
+DEMUXERS = "flv,mov,mp4,m4a,matroska,webm,avi,asf,aac,ac3,eac3,amr,mpegts,mpeg,mp3,ogg,wav,flac,aiff,au,w64,caf"
 """What FFmpeg may take such a file for: not a playlist, which names other files and addresses to be opened."""
 
 LOUDEST = 2.0**31
-"""Largest sample; even whole numbers of 32 bits that were not scaled to 1 stay below."""
+"""Largest sample: of whole numbers of 32 bits that were not scaled to 1."""
 
 BLOCK = 1 << 18
 """Samples of all channels together that are decoded at a time."""
 
 HOLE = 0.05
-"""Seconds of sound that may be missing between two packets of a video before they count as lost."""
+"""Seconds by which the times of packets may jump before sound counts as lost, or as there twice."""
+
+LONGEST_HOLE = 600.0
+"""Seconds of sound that may be missing; a longer jump is a damaged time, or another recording."""
+
+RESTART = 1.0
+"""Seconds by which times go back where another recording begins."""
+
+STEP = 4096
+"""Samples over which channels may cancel."""
+
+CANCELLED, LOST = 0.6, 0.1
+"""Share of the energy of unrelated channels below which channels cancel, and of all energy that may be lost so."""
+
+SILENT = 1e-4
+"""Share of the loudest channel's energy below which a channel has no sound."""
+
+OVERSHOOT, LOUD = 1.5, 8.0
+"""Peaks that lossy codecs and resampling reach, and above which samples are whole numbers."""
 
 LENGTH_IS_KNOWN = ("WAV", "WAVEX", "RF64", "AIFF")
 """Formats whose number of samples follows from the size of the file."""
@@ -73,33 +96,54 @@ FULL_SCALE = {"uint8": (128.0, 128), "int16": (32768.0, 0), "int32": (2.0**31, 0
 def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
     """Read a recording, or the sound of a video, as (S,) float32 mono at 16 kHz.
 
-    Channels are averaged; another rate is resampled by soxr (high quality). The file's header is checked before
-    anything is decoded, and decoding ends where the speech becomes too long.
+    A file is read by its content, whatever its name. Channels are averaged, as :func:`mono` does; another rate is
+    resampled by soxr (high quality). The file's header is checked before anything is decoded, and decoding ends where
+    the speech becomes too long.
 
     Args:
         path: the file.
         max_seconds: longest speech allowed; None for any.
     """
-    return to_speech(*_read(path, max_seconds), str(path))
+    return to_speech(*_read(path, str(path), max_seconds), str(path))
 
 
 def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
     """Read a recording as :func:`read_speech` does, at its own rate from 16 to 48 kHz; the samples and the rate."""
-    samples, rate = _read(path, None)
+    samples, rate = _read(path, str(path), None)
     playable = _rate_to_play(rate)
     return _resampled(_checked(samples, str(path)), rate, playable), playable
 
 
-def _read(path: Path, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
-    if not path.is_file() or path.stat().st_size == 0:
+def _read(source: Path | IO[bytes], name: str, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
+    """Mono samples (S,) of a file and their rate, by libsndfile or, where that knows no such content, by PyAV."""
+    with _opened(source, name) as stream:
+        refuse_cut_short(stream, name)
+        try:
+            with open_sound(stream, name) as sound:
+                readable = sound.frames > 0  # a header that was never completed tells none; PyAV reads what follows
+        except FaceDiffError as error:
+            readable, refusal = False, error
+        else:
+            refusal = FaceDiffError(f"{name}: holds no samples; expected speech")
+        stream.seek(0)
+        if not readable:
+            return _decode_container(stream, name, max_seconds, refusal)
+        with open_sound(stream, name) as sound:
+            return _decoded(sound, name, max_seconds)
+
+
+@contextmanager
+def _opened(source: Path | IO[bytes], name: str) -> Iterator[IO[bytes]]:
+    """A file as a stream of bytes: a library that opens it by itself would go by its name and by files beside it."""
+    if not isinstance(source, Path):
+        yield source
+        return
+    if not source.is_file() or source.stat().st_size == 0:
         raise FaceDiffError(
-            f"{path}: no such sound file, or an empty one; expected speech as {', '.join(SUFFIXES + CONTAINERS)}"
+            f"{name}: no such sound file, or an empty one; expected speech as {', '.join(SUFFIXES + CONTAINERS)}"
         )
-    refuse_cut_short(path)
-    if path.suffix.lower() in CONTAINERS:
-        return _decode_container(path, max_seconds)
-    with open_sound(path) as sound:
-        return _decoded(sound, path, max_seconds)
+    with source.open("rb") as stream:
+        yield stream
 
 
 def write_wav(path: Path, samples: npt.NDArray[Any], rate: int, bits: int = 16) -> None:
@@ -122,13 +166,69 @@ def _rate_to_play(rate: float) -> int:
 
 
 def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.floating]:
-    """Mono, where all samples are in range."""
+    """Mono, where all samples are in range; whole numbers that were made floating point are scaled to 1."""
     peak = float(np.maximum(samples.max(initial=0.0), -samples.min(initial=0.0)))  # without a copy of all samples
     if not len(samples) or not peak <= LOUDEST:
         raise FaceDiffError(
             f"{name}: holds no samples, or up to {peak:g}; expected speech of finite numbers with a full scale of 1"
         )
-    return samples if samples.ndim == 1 else samples.mean(axis=1)
+    if peak > 1.001:
+        scale = next(full for full in (2.0**15, 2.0**23, LOUDEST) if peak <= full) if peak > LOUD else peak
+        if peak > OVERSHOOT:
+            note(f"{name}: its samples reach {peak:g} where full scale is 1; they are divided by {scale:g}")
+        samples = samples / np.float32(scale)
+    return samples if samples.ndim == 1 else mono(lambda: iter([samples]), name)
+
+
+def mono(
+    blocks: Callable[[], Iterator[npt.NDArray[np.floating]]],
+    name: str,
+    length: int | None = None,
+    say: Callable[[str], None] = note,
+) -> Samples:
+    """The mean of the channels that have any sound; the loudest channel alone where they cancel each other.
+
+    Args:
+        blocks: gives the samples (n, channels) of each block in order, and again from the beginning when called again.
+        name: what the note on channels that cancel calls the recording.
+        length: number of all samples, where it is known: a long recording then fits once into memory, not twice.
+        say: takes that note.
+
+    Returns:
+        Samples (S,).
+    """
+    energy, spent, lost = np.zeros(1), 0.0, 0.0
+
+    def mean(block: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        nonlocal energy, spent, lost
+        if block.shape[1] == 1:
+            return block[:, 0]
+        mixed = block.mean(axis=1)
+        starts = np.arange(0, len(block), STEP)
+        each = np.add.reduceat(np.square(block, dtype=np.float64), starts, axis=0)
+        together = np.add.reduceat(np.square(mixed, dtype=np.float64), starts) * block.shape[1] ** 2
+        energy, unrelated = energy + each.sum(axis=0), each.sum(axis=1)
+        spent, lost = spent + float(unrelated.sum()), lost + float(unrelated[together < CANCELLED * unrelated].sum())
+        return mixed
+
+    samples = _joined(map(mean, blocks()), length)
+    if lost > LOST * spent:
+        loudest = int(energy.argmax())
+        say(f"{name}: its channels cancel each other; channel {loudest + 1} alone is taken")
+        return _joined((block[:, loudest] for block in blocks()), length)
+    sounding = int((energy > SILENT * energy.max()).sum())
+    return samples if sounding in (0, len(energy)) else samples * np.float32(len(energy) / sounding)
+
+
+def _joined(pieces: Iterable[npt.NDArray[np.floating]], length: int | None) -> Samples:
+    if length is None:
+        parts = [np.array(piece, np.float32) for piece in pieces]
+        return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+    samples, filled = np.empty(length, np.float32), 0
+    for piece in pieces:
+        samples[filled : filled + len(piece)] = piece
+        filled += len(piece)
+    return samples
 
 
 def _resampled(mono: npt.NDArray[np.floating], rate: float, to: int) -> npt.NDArray[np.float32]:
@@ -158,91 +258,141 @@ def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
     """A ``soundfile.SoundFile``."""
     import soundfile
 
-    path = source if isinstance(source, Path) else Path(name)
+    name = name or str(source)
     try:
-        # As bytes, since a name need not be UTF-8.
-        with soundfile.SoundFile(os.fsencode(source) if isinstance(source, Path) else source) as file:
+        with _opened(source, name) as stream, soundfile.SoundFile(stream) as file:
             yield file
     except (soundfile.LibsndfileError, RuntimeError, TypeError, ValueError, OSError) as error:
         raise FaceDiffError(
-            f"{path}: not a readable sound file ({_reason(path, error)}); "
+            f"{name}: not a readable sound file ({_reason(name, error)}); "
             f"expected one of {', '.join(SUFFIXES + CONTAINERS)}"
         ) from error
 
 
-def _reason(path: Path, error: Exception) -> str:
+def _reason(name: str, error: Exception) -> str:
     """A library's message about a file, without the name that begins it already."""
-    return brief(str(error).replace(f"Error opening {os.fsencode(path)!r}: ", "").replace(str(path), path.name))
+    return brief(re.sub(r"Error opening <.*?>: ", "", str(error)).replace(name, Path(name).name))
 
 
-def _decoded(file: Any, path: object, limit: float | None) -> tuple[npt.NDArray[np.float32], int]:  # noqa: ANN401
-    """All samples (S,) of a ``soundfile.SoundFile``, its channels averaged."""
+def _decoded(file: Any, name: str, limit: float | None) -> tuple[Samples, int]:  # noqa: ANN401
+    """All samples (S,) of a ``soundfile.SoundFile``."""
     declared, rate = int(file.frames), int(file.samplerate)
     counted_frames = 0 <= declared < UNKNOWN
-    _check_length(path, declared / rate if counted_frames else 0, limit)
-    parts, decoded = [], 0
-    # A long recording fits once into memory, not twice.
-    samples = np.empty(declared, np.float32) if counted_frames and file.format in LENGTH_IS_KNOWN else None
-    while len(block := file.read(max(1, BLOCK // file.channels), dtype="float32", always_2d=True)):
-        mono = block[:, 0].copy() if file.channels == 1 else block.mean(axis=1)
-        if samples is None:
-            parts.append(mono)
-        else:
-            samples[decoded : decoded + len(mono)] = mono
-        decoded += len(block)
-        _check_length(path, decoded / rate, limit)
-    # Without a frame that tells the number of frames, the length of an mp3 is an estimate.
-    if counted_frames and decoded < declared and file.format != "MP3":
-        raise FaceDiffError(
-            f"{path}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
-        )
-    if samples is not None:
-        return samples, rate
-    return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
+    estimated = file.subtype.startswith("MPEG")  # unless a frame of an mp3 tells the number of frames
+    _check_length(name, declared / rate if counted_frames else 0, limit)
+
+    def blocks() -> Iterator[npt.NDArray[np.float32]]:
+        decoded = 0
+        if file.tell():
+            file.seek(0)
+        while len(block := file.read(max(1, BLOCK // file.channels), dtype="float32", always_2d=True)):
+            decoded += len(block)
+            _check_length(name, decoded / rate, limit)
+            yield block
+        if counted_frames and decoded < declared and not estimated:
+            raise FaceDiffError(
+                f"{name}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
+            )
+
+    is_known = file.format in LENGTH_IS_KNOWN and counted_frames and not estimated
+    return mono(blocks, name, declared if is_known else None), rate
 
 
-def _decode_container(path: Path, limit: float | None) -> tuple[npt.NDArray[np.float32], int]:
-    """The first sound track of a video, (S,) mono, from the time of its first picture on."""
-    with needs_extra("av", "prepare", f"extracting the sound of {path.suffix} files"):
-        import av
-        from av.audio.resampler import AudioResampler
-    parts: list[npt.NDArray[np.float32]] = []
+def _decode_container(stream: IO[bytes], name: str, limit: float | None, refusal: FaceDiffError) -> tuple[Samples, int]:
+    """The sound track of a container in which there is a voice, (S,) mono, from the time of its first picture on.
+
+    Args:
+        stream: the file.
+        name: what messages call it.
+        limit: longest speech allowed.
+        refusal: the error where FFmpeg knows no such content either.
+    """
     try:
-        with path.open("rb") as stream, av.open(stream, options={"format_whitelist": DEMUXERS}) as container:
-            if not container.streams.audio:
-                raise FaceDiffError(f"{path}: has no sound track; expected a video with speech")
-            track = container.streams.audio[0]
-            rate = int(track.rate)
-            if track.duration and track.time_base:
-                _check_length(path, float(track.duration * track.time_base), limit)
-            plain = AudioResampler(format="fltp", layout="mono", rate=rate)
-            decoded, late, start, heard = 0, None, None, 0
-            for frame in chain(container.decode(audio=0), [None]):  # at None, what the resampler still holds comes out
-                if late is None and frame is not None:
-                    late, start = round(_seconds_after_picture(container, frame.time) * rate), frame.time
-                    decoded += max(0, late)
-                if frame is not None and start is not None and frame.time is not None:
-                    hole = round((frame.time - start) * rate) - heard
-                    if hole > HOLE * rate:  # packets were lost: what follows stays in step with the pictures
-                        _check_length(path, (decoded + hole) / rate, limit)
-                        parts.append(np.zeros(hole, np.float32))
-                        decoded, heard = decoded + hole, heard + hole
-                    heard += frame.samples
-                for part in plain.resample(frame):
-                    parts.append(part.to_ndarray()[0])
-                    decoded += len(parts[-1])
-                _check_length(path, decoded / rate, limit)
+        with needs_extra("av", "prepare", f"extracting the sound of {Path(name).suffix} files"):
+            import av
+    except MissingExtraError as error:
+        raise (error if Path(name).suffix.lower() in CONTAINERS else refusal) from error
+
+    def opened() -> Any:  # noqa: ANN401
+        stream.seek(0)
+        return av.open(stream, options={"format_whitelist": DEMUXERS})
+
+    tracks: list[tuple[float, Samples, list[str]]] = []
+    try:
+        with opened() as container:
+            rates = [int(track.rate) for track in container.streams.audio]
+        if not rates:
+            raise FaceDiffError(f"{name}: has no sound track; expected a video with speech")
+        for number, rate in enumerate(rates):
+            notes: list[str] = []
+            samples = mono(partial(_track, opened, number, name, limit, notes.append), name, say=notes.append)
+            clear = loudness_range(_resampled(samples, rate, SAMPLE_RATE)) if len(rates) > 1 else math.inf
+            tracks.append((clear, samples, notes))
+            if clear >= NOISY:
+                break
     except (av.FFmpegError, AttributeError, ValueError, TypeError, OSError) as error:  # a track may lack its rate
-        raise FaceDiffError(f"{path}: its sound cannot be read ({_reason(path, error)}); convert it to .wav") from error
-    if not parts or not late:
-        return np.concatenate(parts) if parts else np.zeros(0, np.float32), rate
-    return np.concatenate([np.zeros(max(0, late), np.float32), *parts])[max(0, -late) :], rate
+        if Path(name).suffix.lower() not in CONTAINERS:
+            raise refusal from error
+        raise FaceDiffError(f"{name}: its sound cannot be read ({_reason(name, error)}); convert it to .wav") from error
+    best = max(range(len(tracks)), key=lambda number: tracks[number][0])
+    _, samples, notes = tracks[best]
+    if best:
+        notes.append(f"{name}: its sound track {best + 1} of {len(rates)} is taken, in which the voice is clearest")
+    for remark in dict.fromkeys(notes):
+        note(remark)
+    return samples, rates[best]
 
 
-def _seconds_after_picture(container: Any, sound: float | None) -> float:  # noqa: ANN401 - PyAV's
-    """How long after the first picture of a video its sound begins; the picture may also come after it."""
-    start = next((track.start_time * track.time_base for track in container.streams.video if track.start_time), 0)
-    return 0.0 if sound is None or not container.streams.video else float(sound - start)
+def _track(
+    opened: Callable[[], Any], number: int, name: str, limit: float | None, say: Callable[[str], None]
+) -> Iterator[npt.NDArray[np.float32]]:
+    """Samples (n, channels) of a sound track, with silence where its packets' times jump."""
+    done, start, aligned, faults = 0, None, False, Counter[str]()
+    with opened() as container:
+        track = container.streams.audio[number]
+        rate = int(track.rate)
+        if track.duration and track.time_base:
+            _check_length(name, float(track.duration * track.time_base), limit)
+        for frame in container.decode(track):
+            samples, channels = _scaled(frame.to_ndarray()), frame.layout.nb_channels
+            block = samples.T if frame.format.is_planar else samples.reshape(-1, channels)
+            if frame.time is not None:
+                start = _first_time(container, frame.time) if start is None else start
+                ahead = round((frame.time - start) * rate) - done  # of the samples so far
+                if done and ahead < -RESTART * rate:
+                    faults["have times that begin anew, and follow the others"] += len(block)
+                    start, ahead = frame.time - done / rate, 0
+                if ahead > LONGEST_HOLE * rate:
+                    raise FaceDiffError(
+                        f"{name}: its sound stops at {done / rate:.1f} s and goes on {ahead / rate:.0f} s later; "
+                        f"cut it there, or convert it to .wav"
+                    )
+                if not aligned or abs(ahead) > HOLE * rate:  # what follows stays in step with the pictures
+                    _check_length(name, (done + ahead) / rate, limit)
+                    if ahead > HOLE * rate:
+                        faults["are missing by its times, and are silence"] += ahead
+                    elif done:
+                        faults["have the times of sound before them, and are left out"] += min(-ahead, len(block))
+                    if ahead > 0:
+                        yield np.zeros((ahead, channels), np.float32)
+                        done += ahead
+                    block = block[max(0, -ahead) :]
+                    aligned = len(block) > 0
+            done += len(block)
+            yield block
+            _check_length(name, done / rate, limit)
+    for fault, count in faults.items():
+        say(f"{name}: {count / rate:.2f} s of its sound {fault}")
+
+
+def _first_time(container: Any, sound: float) -> float:  # noqa: ANN401 - PyAV's
+    """The time of the first picture; of a file without pictures the zero of its clock, or the sound's own beginning."""
+    if container.streams.video:
+        return float(
+            next((video.start_time * video.time_base for video in container.streams.video if video.start_time), 0)
+        )
+    zero_based = {"mp4", "matroska"} & {*container.format.name.split(",")} and sound < LONGEST_HOLE
+    return 0.0 if zero_based else sound
 
 
 def read_stretch(
@@ -259,11 +409,12 @@ def read_stretch(
         refuse_cut_short(path)
         if complete is not None:
             complete.add(path)
-    with open_sound(path) as file:
-        if file.samplerate == SAMPLE_RATE and file.channels == 1 and file.seekable():
+    with suppress(FaceDiffError), open_sound(path) as file:
+        # Samples in floating point may go beyond 1, by which all of them are divided.
+        is_plain = file.channels == 1 and file.seekable() and file.subtype not in ("FLOAT", "DOUBLE")
+        if is_plain and file.samplerate == SAMPLE_RATE and file.frames:
             file.seek(min(first, file.frames))
-            samples = file.read(length, dtype="float32")
-            return fit_length(_checked(samples, str(path)) if len(samples) else samples, length)
+            return fit_length(file.read(length, dtype="float32"), length)
     if store is None:
         return fit_length(read_speech(path)[first:], length)
     facts = path.stat()
@@ -316,7 +467,7 @@ class SpeechRecording:
 
 def read_recording(path: Path, max_seconds: float | None = None) -> SpeechRecording:
     """A wav, flac, ogg, mp3 or video file, to animate."""
-    return SpeechRecording.of(*_read(path, max_seconds), path.stem, str(path))
+    return SpeechRecording.of(*_read(path, str(path), max_seconds), path.stem, str(path))
 
 
 def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
@@ -352,8 +503,7 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
     if hasattr(speech, "read"):
         file = cast("IO[bytes]", speech)
         path = file.name if isinstance(getattr(file, "name", None), str) else "speech"
-        with open_sound(file, path) as sound:
-            return SpeechRecording.of(*_decoded(sound, path, max_seconds), Path(path).stem, path)
+        return SpeechRecording.of(*_read(file, path, max_seconds), Path(path).stem, path)
     if isinstance(speech, tuple):
         if len(speech) != 2:
             raise FaceDiffError("speech: expected samples and their rate, as a pair or as speech and rate=")
@@ -365,33 +515,35 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
             raise FaceDiffError("rate: is missing; give the array's sample rate, as in animate(samples, rate=48000)")
         rate = SAMPLE_RATE
     rate = check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz")
-    waveform = mono_waveform(cast("Waveform", speech), "speech")
-    _check_length("speech", len(waveform) / rate, max_seconds)
-    return SpeechRecording.of(waveform, rate, "speech", "speech")
+    samples = waveform(cast("Waveform", speech), "speech")
+    _check_length("speech", len(samples) / rate, max_seconds)
+    return SpeechRecording.of(samples, rate, "speech", "speech")
 
 
-def mono_waveform(samples: Waveform, name: str) -> npt.NDArray[np.float32]:
-    """Samples (S,) with full scale 1 from an array or a tensor; channels, along the shorter axis, are averaged."""
+def waveform(samples: Waveform, name: str) -> Samples:
+    """Samples (S,) or (S, channels) with full scale 1 from an array or a tensor; channels are its shorter axis."""
     tensor: Any = samples
     if hasattr(tensor, "detach"):
         tensor = tensor.detach().cpu()
         samples = tensor.float() if tensor.is_floating_point() else tensor  # NumPy has no bfloat16
     array = np.asarray(samples)
-    scale = FULL_SCALE.get(array.dtype.name)
-    if (array.dtype.kind != "f" and scale is None) or array.ndim not in (1, 2) or not array.size:
+    is_sound = array.dtype.kind == "f" or array.dtype.name in FULL_SCALE
+    if not is_sound or array.ndim not in (1, 2) or not array.size:
         raise FaceDiffError(
             f"{name}: is {array.dtype} of shape {array.shape}; expected samples (S,) or (S, channels) in floating "
             f"point, int16, int32 or uint8, or the path of a recording"
         )
+    samples = _scaled(array)
+    return samples.T if samples.ndim == 2 and samples.shape[0] < samples.shape[1] else samples
+
+
+def _scaled(array: npt.NDArray[Any]) -> Samples:
+    """Samples of any shape with a full scale of 1; floating point as it is."""
     with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is refused
-        plain = (
-            array.astype(np.float32)
-            if scale is None
-            else ((array.astype(np.float64) - scale[1]) / scale[0]).astype(np.float32)
-        )
-    if plain.ndim == 2:
-        plain = plain.mean(axis=int(np.argmin(plain.shape)))
-    return plain
+        if array.dtype.name not in FULL_SCALE:
+            return array.astype(np.float32)
+        scale, silence = FULL_SCALE[array.dtype.name]
+        return ((array.astype(np.float64) - silence) / scale).astype(np.float32)
 
 
 def stream_piece(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
@@ -401,7 +553,14 @@ def stream_piece(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
     if samples.ndim != 1:
         shape = f"{len(chunk)} bytes" if odd else f"the shape {np.shape(chunk)}"
         raise FaceDiffError(f"chunks: one has {shape}; expected mono samples (n,), or bytes of 16-bit samples")
-    return _checked(mono_waveform(samples, "chunks"), "chunks") if len(samples) else np.zeros(0, np.float32)
+    if not len(samples):
+        return np.zeros(0, np.float32)
+    piece = waveform(samples, "chunks")
+    if (
+        peak := float(np.abs(piece).max())
+    ) > LOUD and peak <= LOUDEST:  # of the whole stream's scale a piece tells nothing
+        raise FaceDiffError(f"chunks: one reaches {peak:g}; expected floating point with a full scale of 1, or int16")
+    return _checked(piece, "chunks") if not peak <= LOUDEST else piece
 
 
 # Decoders return the samples that they find, and only some of them say that there should be more. A recording that was
@@ -414,22 +573,23 @@ OPEN_ENDS = (range(0x7FFF_F000, 0x8000_0001), range(0xFFFF_0000, 0x1_0000_0000))
 CUT = "is cut short"
 
 
-def refuse_cut_short(path: Path) -> None:
+def refuse_cut_short(source: Path | IO[bytes], name: str = "") -> None:
     """Refuse a recording that ends before its container says."""
-    remark = cut_short(path)
+    remark = cut_short(source)
     if remark is not None:
         raise FaceDiffError(
-            f"{path}: {CUT}: {remark}; copy it again, or convert what there is with ffmpeg if that is all you want"
+            f"{name or source}: {CUT}: {remark}; copy it again, or convert what there is with ffmpeg if that is all "
+            f"you want"
         )
 
 
-def cut_short(path: Path) -> str | None:
+def cut_short(source: Path | IO[bytes]) -> str | None:
     """The part that a recording lacks at its end; None if it is whole, or if its format's decoder reports it.
 
     Wav, AIFF, MP4 and Ogg are checked, by their headers only; others, such as flac, are left to the decoder. Of an mp3
     nothing tells how long it should be.
     """
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with _opened(source, str(source)) as stream, _mapped(stream) as data:
         head = data[:12]
         if head[:4] in (b"RIFF", b"RF64", b"BW64") and head[8:] == b"WAVE":
             return _chunks(data, "<4sI", b"data")
@@ -442,11 +602,24 @@ def cut_short(path: Path) -> str | None:
         return None
 
 
+@contextmanager
+def _mapped(stream: IO[bytes]) -> Iterator[mmap.mmap | bytes]:
+    """The content of an open file."""
+    try:
+        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError, AttributeError):  # it is none of the system's
+        yield stream.read()
+        stream.seek(0)
+        return
+    with data:
+        yield data
+
+
 def _bytes(count: int) -> str | None:
     return f"{count} bytes are missing at its end" if count > 0 else None
 
 
-def _chunks(data: mmap.mmap, form: str, samples: bytes) -> str | None:
+def _chunks(data: mmap.mmap | bytes, form: str, samples: bytes) -> str | None:
     """Wav and AIFF: chunks with a name of 4 bytes and a size each, one of which holds the samples."""
     at, large = 12, None
     while at + 8 <= len(data):
@@ -462,7 +635,7 @@ def _chunks(data: mmap.mmap, form: str, samples: bytes) -> str | None:
     return None
 
 
-def _ogg(data: mmap.mmap) -> str | None:
+def _ogg(data: mmap.mmap | bytes) -> str | None:
     """Ogg: pages, of which the last one is marked."""
     at, last = 0, False
     while at + 27 <= len(data):
@@ -479,7 +652,7 @@ def _ogg(data: mmap.mmap) -> str | None:
     return None if last else "its last page is missing"
 
 
-def _boxes(data: mmap.mmap) -> str | None:
+def _boxes(data: mmap.mmap | bytes) -> str | None:
     """MP4 and QuickTime: boxes with a size and a name each; one of size 0 reaches to the end."""
     at = 0
     while at + 8 <= len(data):

@@ -426,6 +426,9 @@ CLIPPED = 1e-3
 NOISY = 25.0
 """Decibels between speech and what goes on in its pauses below which a recording counts as noisy."""
 
+PART = SAMPLE_RATE // 20
+"""Samples of a part whose loudness counts."""
+
 TONAL = 0.1
 """Spectral flatness of what goes on in pauses below which it is music or hum, and above which it is hiss."""
 
@@ -444,20 +447,14 @@ def speech_problems(speech: Wave) -> list[str]:
     problems = []
     if _clipped(speech, 0.998 * peak) > CLIPPED:
         problems.append("is clipped: its loudest samples are cut off; record it at a lower level")
-    size = SAMPLE_RATE // 20
-    parts = speech[: len(speech) // size * size].reshape(-1, size)
-    if len(parts) < 10:
+    if len(speech) < 10 * PART:
         return problems
-    powers = [
-        np.square(some - some.mean(1, keepdims=True)).mean(1)
-        for some in (np.asarray(parts[first : first + 1000], np.float64) for first in range(0, len(parts), 1000))
-    ]
-    levels = 10 * np.log10(np.concatenate(powers) + 1e-12)
-    soft = np.argsort(levels)[: max(4, len(parts) // 20)]
+    parts = speech[: len(speech) // PART * PART].reshape(-1, PART)
+    levels, soft = _levels(parts)
     apart = float(np.percentile(levels, 80) - levels[soft].mean())
     if apart < NOISY:
         power = (
-            np.square(np.abs(np.fft.rfft(parts[soft].astype(np.float64) * np.hanning(size), axis=1)))[:, 4:-8].mean(0)
+            np.square(np.abs(np.fft.rfft(parts[soft].astype(np.float64) * np.hanning(PART), axis=1)))[:, 4:-8].mean(0)
             + 1e-12
         )
         flatness = float(np.exp(np.log(power).mean()) / power.mean())
@@ -467,6 +464,24 @@ def speech_problems(speech: Wave) -> list[str]:
         else:
             problems.append(f"has {what} {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
     return problems
+
+
+def loudness_range(speech: Wave) -> float:
+    """Decibels between the loud parts of a recording (S,) at 16 kHz and its pauses; below 0 where it is silent."""
+    if len(speech) < PART or float(np.abs(speech).max()) < 1e-4:
+        return -1.0
+    levels, soft = _levels(speech[: len(speech) // PART * PART].reshape(-1, PART))
+    return float(np.percentile(levels, 80) - levels[soft].mean())
+
+
+def _levels(parts: Wave) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.intp]]:
+    """Decibels of parts (n, PART), and the softest of them."""
+    powers = [
+        np.square(some - some.mean(1, keepdims=True)).mean(1)
+        for some in (np.asarray(parts[first : first + 1000], np.float64) for first in range(0, len(parts), 1000))
+    ]
+    levels = 10 * np.log10(np.concatenate(powers) + 1e-12)
+    return levels, np.argsort(levels)[: max(4, len(parts) // 20)]
 
 
 def _clipped(speech: Wave, level: float) -> float:

@@ -19,7 +19,7 @@ TONE = (0.3 * np.sin(np.arange(16000) / 7)).astype(np.float32)
 def recording(tmp_path: Path) -> Path:
     """A second in stereo at 22 050 Hz, 16 bits."""
     path = tmp_path / "tone.wav"
-    soundfile.write(path, np.stack([TONE, -0.5 * TONE], 1), 22050, subtype="PCM_16")
+    soundfile.write(path, np.stack([TONE, 0.5 * TONE], 1), 22050, subtype="PCM_16")
     return path
 
 
@@ -39,7 +39,7 @@ def test_open_files_and_audio_of_data_sets_are_the_recording(recording: Path) ->
             found = speech_of(speech)  # type: ignore[arg-type]
             assert (found.name, found.rate) == (name, 22050), form
             np.testing.assert_allclose(found.speech, expected.speech, rtol=0, atol=2e-7, err_msg=form)
-            np.testing.assert_allclose(found.sound, 0.25 * TONE, rtol=0, atol=1 / 32768, err_msg=form)
+            np.testing.assert_allclose(found.sound, 0.75 * TONE, rtol=0, atol=1 / 32768, err_msg=form)
 
 
 @pytest.mark.parametrize(

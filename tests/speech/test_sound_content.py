@@ -1,0 +1,241 @@
+"""Sound is read by its content and its times: any container under any name, holes, channels and tracks with a voice."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import soundfile
+
+from facediff.errors import FaceDiffError, Note
+from facediff.speech.audio import read_recording, read_speech, read_stretch, speech_of, stream_piece
+
+RATE = 16_000
+SAMPLES = npt.NDArray[np.floating]
+TIMES = np.arange(2 * RATE) / RATE
+# Syllables and pauses, as speech has them.
+VOICE = (0.3 * np.sin(2 * np.pi * 220 * TIMES) * (np.sin(2 * np.pi * 2 * TIMES) > 0)).astype(np.float32)
+HUM = (0.3 * np.sin(2 * np.pi * 50 * TIMES)).astype(np.float32)
+
+
+def container(
+    form: str,
+    tracks: Sequence[SAMPLES],
+    codec: str = "",
+    *,
+    pictures: int = 0,
+    jumps: Sequence[tuple[float, float]] = (),
+) -> bytes:
+    """A file of sound tracks (S,); packets from each time on are shifted by seconds, and lost if by infinity."""
+    av = pytest.importorskip("av")
+    file = io.BytesIO()
+    with av.open(file, "w", format=form) as out:
+        muxed: list[Any] = []
+        if pictures:
+            video: Any = out.add_stream("flv1" if form == "flv" else "mpeg4", rate=25)
+            video.width = video.height = 32
+            frames = [av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8)) for _ in range(pictures)]
+            muxed += [packet for frame in [*frames, None] for packet in video.encode(frame)]
+        for samples in tracks:
+            rate = 48_000 if codec in ("libopus", "ac3") else RATE
+            stream: Any = out.add_stream(codec or "pcm_s16le", rate=rate, layout="mono")
+            sound = av.AudioFrame.from_ndarray((samples * 32767).astype(np.int16)[None], format="s16", layout="mono")
+            sound.sample_rate, sound.pts, sound.time_base = RATE, 0, Fraction(1, RATE)
+            context = stream.codec_context
+            context.format = stream.codec_context.codec.audio_formats[0] if codec == "ac3" else context.format
+            parts = av.AudioResampler(context.format, "mono", rate, context.frame_size or 800)
+            packets = [p for s in (sound, None) for part in parts.resample(s) for p in stream.encode(part)]
+            for packet in [*packets, *stream.encode(None)]:
+                shift = sum(by for at, by in jumps if float(packet.pts * packet.time_base) >= at - 1e-6)
+                if np.isfinite(shift):
+                    packet.pts = packet.dts = packet.pts + round(shift / float(packet.time_base))
+                    muxed.append(packet)
+        out.mux(muxed)
+    return file.getvalue()
+
+
+def shifted(flv: bytes, at: float, by: float) -> bytes:
+    """The same .flv with its packets of sound from a time on shifted by seconds, also backwards."""
+    content, place = bytearray(flv), 13
+    while place < len(content):
+        size, time = (int.from_bytes(content[place + k : place + k + 3], "big") for k in (1, 4))
+        if content[place] == 8 and time >= 1000 * at and size > 4:
+            content[place + 4 : place + 7] = (time + round(1000 * by)).to_bytes(3, "big")
+        place += 15 + size
+    return bytes(content)
+
+
+def wav(samples: SAMPLES, subtype: str = "PCM_16", form: str = "WAV") -> bytes:
+    file = io.BytesIO()
+    soundfile.write(file, samples, RATE, format=form, subtype=subtype)
+    return file.getvalue()
+
+
+def like(found: SAMPLES, expected: SAMPLES) -> float:
+    """The correlation of two recordings of about the same length."""
+    assert abs(len(found) - len(expected)) < 0.2 * RATE
+    length = min(len(found), len(expected))
+    return float(np.corrcoef(found[:length], expected[:length])[0, 1])
+
+
+FORMS = (
+    "webm-libopus ipod-aac mp4-aac matroska- avi- flv-aac mpegts-mp2 adts-aac "
+    "wav-adpcm_ms wav-libmp3lame caf- ogg-libopus asf-libmp3lame ac3-ac3"
+)
+
+
+@pytest.mark.parametrize(("form", "codec"), [form.split("-") for form in FORMS.split()])
+@pytest.mark.parametrize("name", ["a.wav", "a.mp3", "a", "a.txt", "a.mp4"])
+def test_any_container_is_read_under_any_name(form: str, codec: str, name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(container(form, [VOICE], codec))
+    found = read_speech(path)
+    assert abs(len(found) - len(VOICE)) < 0.15 * RATE
+    assert max(like(found[delay:][: len(VOICE)], VOICE) for delay in range(0, 2400, 8)) > 0.9  # encoders have delays
+    with path.open("rb") as file:
+        np.testing.assert_array_equal(speech_of(file).speech, found)
+    np.testing.assert_array_equal(speech_of(io.BytesIO(path.read_bytes())).speech, found)
+    np.testing.assert_array_equal(read_stretch(path, 800, 1600, None), found[800:2400])
+
+
+@pytest.mark.parametrize("sidecar", ["._a.mp3", "._a.wav", ".a.mp3"])
+def test_files_beside_a_recording_do_not_count(sidecar: str, tmp_path: Path) -> None:
+    path = tmp_path / sidecar.lstrip("._")
+    path.write_bytes(wav(VOICE, "MPEG_LAYER_III", "MP3"))
+    expected = read_speech(path)
+    (tmp_path / sidecar).write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X" + bytes(4096))
+    np.testing.assert_array_equal(read_speech(path), expected)
+
+
+@pytest.mark.parametrize("riff", [0, 8, 36, 36 + 2 * len(VOICE)])
+def test_a_wav_that_was_never_closed_is_read(riff: int, tmp_path: Path) -> None:
+    content = bytearray(wav(VOICE))
+    content[4:8], content[40:44] = struct.pack("<I", riff), bytes(4)
+    (tmp_path / "a.wav").write_bytes(content)
+    pytest.importorskip("av")
+    assert like(read_speech(tmp_path / "a.wav"), VOICE) > 0.999
+
+
+def test_a_recording_in_memory_that_is_cut_short_is_refused() -> None:
+    with pytest.raises(FaceDiffError, match="cut short"):
+        speech_of(io.BytesIO(wav(VOICE)[:-999]))
+
+
+@pytest.mark.parametrize("form", ["mp4", "matroska", "flv"])
+@pytest.mark.parametrize("pictures", [0, 50])
+def test_sound_stays_where_its_times_have_it(form: str, pictures: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+
+    def read(*jumps: tuple[float, float]) -> SAMPLES:
+        path.write_bytes(container(form, [VOICE], "" if form == "matroska" else "aac", pictures=pictures, jumps=jumps))
+        return read_speech(path)
+
+    whole = read()
+    with pytest.warns(Note, match="missing by its times"):
+        hole = read((0.75, 0.5))
+    expected = np.concatenate([whole[: round(0.75 * RATE)], np.zeros(RATE // 2), whole[round(0.75 * RATE) :]])
+    assert like(hole, expected) > 0.9
+    if pictures or form in ("mp4", "matroska"):  # where a file without pictures has its own zero
+        with pytest.warns(Note, match="missing by its times"):
+            late = read((-1.0, 0.4))
+        assert like(late, np.concatenate([np.zeros(round(0.4 * RATE)), whole])) > 0.9
+    with pytest.raises(FaceDiffError, match="goes on 7200 s later"):
+        read((1.0, 7200.0))
+
+
+def test_times_that_go_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.flv"
+    flv = container("flv", [VOICE], "aac")
+    path.write_bytes(flv)
+    whole = read_speech(path)
+    path.write_bytes(shifted(flv, 1.024, -0.3))
+    with pytest.warns(Note, match=r"0\.\d+ s of its sound have the times of sound before them"):
+        overlap = read_speech(path)
+    assert like(overlap, np.concatenate([whole[:RATE], whole[round(1.3 * RATE) :]])) > 0.9
+    path.write_bytes(shifted(flv, 1.5, -1.5))  # a recorder that was started anew
+    with pytest.warns(Note, match="begin anew"):
+        assert like(read_speech(path), whole) > 0.999
+
+
+@pytest.mark.parametrize("other", [-1.0, -0.8, -0.5, -0.3])
+@pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT", "MPEG_LAYER_III", "aac"])
+def test_channels_that_cancel_are_not_averaged(other: float, subtype: str, tmp_path: Path) -> None:
+    path, stereo = tmp_path / "a.wav", np.stack([other * VOICE, VOICE], axis=1)
+    if subtype == "aac":
+        av = pytest.importorskip("av")
+        with av.open(str(path), "w", format="ipod") as out:
+            stream: Any = out.add_stream("aac", rate=RATE, layout="stereo")
+            frame = av.AudioFrame.from_ndarray(np.ascontiguousarray(stereo.T), format="fltp", layout="stereo")
+            frame.sample_rate = RATE
+            parts = av.AudioResampler("fltp", "stereo", RATE, 1024)
+            out.mux([p for s in (frame, None) for part in parts.resample(s) for p in stream.encode(part)])
+            out.mux(stream.encode(None))
+    else:
+        path.write_bytes(wav(stereo, subtype, "MP3" if "MPEG" in subtype else "WAV"))
+    with pytest.warns(Note, match="alone is taken"):
+        found = read_speech(path)
+    level = np.sqrt(np.mean(found**2) / np.mean(VOICE**2))
+    assert 0.9 < level < 1.1
+    with pytest.warns(Note, match="channel 1 alone is taken"):
+        np.testing.assert_allclose(speech_of(stereo.T[::-1], RATE).speech, VOICE, atol=1e-6)
+
+
+def test_channels_that_cancel_for_a_while_are_not_averaged() -> None:
+    turned = np.where(np.arange(len(VOICE)) < RATE, VOICE, -VOICE)
+    with pytest.warns(Note, match="cancel"):
+        np.testing.assert_allclose(speech_of(np.stack([VOICE, turned], 1), RATE).speech, VOICE, atol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [2, 6, 8])
+def test_channels_without_sound_do_not_soften_the_others(channels: int, tmp_path: Path) -> None:
+    samples = np.zeros((len(VOICE), channels), np.float32)
+    samples[:, 1] = VOICE
+    (tmp_path / "a.wav").write_bytes(wav(samples))
+    np.testing.assert_allclose(read_speech(tmp_path / "a.wav"), VOICE, atol=1e-4)
+    samples[:, 0] = np.roll(VOICE, RATE // 4)  # another speaker, in turn
+    np.testing.assert_allclose(speech_of(samples, RATE).speech, samples[:, :2].mean(axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("first", [0 * VOICE, HUM, 1e-5 * VOICE])
+def test_the_track_with_the_voice_is_taken(first: SAMPLES, tmp_path: Path) -> None:
+    path = tmp_path / "a.mkv"
+    path.write_bytes(container("matroska", [first, VOICE]))
+    with pytest.warns(Note, match="sound track 2 of 2"):
+        assert like(read_speech(path), VOICE) > 0.999
+    path.write_bytes(container("matroska", [VOICE, first]))
+    assert like(read_speech(path), VOICE) > 0.999
+    path.write_bytes(container("matroska", [VOICE, np.roll(VOICE, RATE)]))  # a dubbed film
+    assert like(read_speech(path), VOICE) > 0.999
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32])
+@pytest.mark.parametrize("floating", [np.float16, np.float32, np.float64])
+def test_whole_numbers_in_floating_point_are_scaled(dtype: Any, floating: Any, tmp_path: Path) -> None:  # noqa: ANN401
+    whole = (VOICE * np.iinfo(dtype).max).astype(dtype)
+    if floating is np.float16 and dtype is np.int32:
+        return
+    expected = speech_of(whole, RATE).speech
+    with pytest.warns(Note, match="they are divided by"):
+        np.testing.assert_allclose(speech_of(whole.astype(floating), RATE).speech, expected, atol=1e-3)
+    soundfile.write(tmp_path / "a.wav", whole.astype(np.float32), RATE, subtype="FLOAT")
+    with pytest.warns(Note, match="they are divided by"):
+        found = read_recording(tmp_path / "a.wav")
+    np.testing.assert_allclose(found.speech, expected, atol=1e-6)
+    assert np.abs(found.sound).max() <= 1
+    with pytest.warns(Note, match="they are divided by"):
+        np.testing.assert_allclose(read_stretch(tmp_path / "a.wav", 9, 99, None), expected[9:108], atol=1e-6)
+    with pytest.raises(FaceDiffError, match="full scale of 1"):
+        stream_piece(whole.astype(np.float32))
+
+
+def test_sound_that_is_a_little_too_loud_is_divided_by_its_peak() -> None:
+    with pytest.warns(Note, match="reach 1.8"):
+        found = speech_of(VOICE * 6, RATE)
+    np.testing.assert_allclose(found.sound, VOICE / 0.3, atol=1e-5)
