@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facediff.errors import damaged
+from facediff.errors import counted, damaged, note
 from facediff.speech.text_grids import SILENCES, phones_in
 from facediff.utils.plain_files import read_rows
 
@@ -17,9 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-STRESS, LENGTH = "ˈˌ", "ː"
-BILABIALS = ("p", "b", "m")
-"""Phonemes for which the lips close."""
+STRESS = "ˈˌ"
 
 OTHER_PACE = 2.5
 """A text that a machine speaks so many times faster or slower than it was recorded is another recording's."""
@@ -93,16 +93,54 @@ def read_phonemes(path: Path) -> list[TimedPhoneme]:
     return phonemes
 
 
-def closed_times(phonemes: Iterable[TimedPhoneme]) -> list[tuple[float, float]]:
-    """Start and end, in seconds, of each p, b and m, in order."""
-    return [
-        (phoneme.start, phoneme.end)
-        for phoneme in sorted(phonemes, key=lambda phoneme: phoneme.start)
-        if phoneme.ipa.strip(STRESS + LENGTH) in BILABIALS
-    ]
+def closed_times(phonemes: Sequence[TimedPhoneme]) -> list[tuple[float, float]]:
+    """Start and end, in seconds, of each p, b and m, in order; labels are as :func:`closing` takes them."""
+    closed = closing([phoneme.ipa for phoneme in phonemes])
+    return sorted(
+        (phoneme.start, phoneme.end) for phoneme, closes in zip(phonemes, closed, strict=True) if closes is not None
+    )
 
 
-def closures(phonemes: Iterable[TimedPhoneme], frame_rate: float) -> list[tuple[int, int]]:
+def closing(labels: Sequence[str]) -> list[str | None]:
+    """The p, b or m for which the lips close at each label of a tier; None where they do not.
+
+    Labels may be in the IPA with diacritics and ties, in X-SAMPA, or in the ARPAbet as Kaldi, the Montreal Forced
+    Aligner, TIMIT and Buckeye write it: with stress, with places in the word, closures as labels of their own. In
+    X-SAMPA capital letters are other sounds, in the ARPAbet they are the same.
+
+    Example:
+        >>> closing(["P_B", "AA1_I", "M_E"]), closing(["p_h", "M", "k͡p", "m="])
+        (['p', None, 'm'], ['p', None, 'p', 'm'])
+    """
+    plain = [_PLACE.sub("", label.strip().strip(_MARKS)) for label in labels]
+    sounding = [label for label in plain if label.lower() not in SILENCES]
+    is_arpabet = any(_STRESSED.fullmatch(label) for label in sounding) or not any(
+        character.islower() for label in sounding for character in label
+    )
+    return [_closing(label.lower() if is_arpabet else label) for label in plain]
+
+
+_PLACE = re.compile(r"_[BIES]$")  # in the word, of Kaldi's phones
+_STRESSED = re.compile(r"[A-Z]{2}[012]")  # a vowel of the ARPAbet
+_MARKS = f"/[](){{}}\"%'{STRESS}"  # brackets, and stress in the IPA and X-SAMPA
+_DIACRITICS = re.compile(r"_[^pb]|[_=~:'`^<>?0-9-]")  # of X-SAMPA; k_p is tied
+_OTHER_NAMES = {"pcl": "p", "bcl": "b", "em": "m", "ɓ": "b", "ʙ": "b", "ʘ": "p", "b_<": "b", "B\\": "b"}
+"""Closures and a syllable of TIMIT; implosive, trill and click of the IPA, and some of them in X-SAMPA."""
+_LETTERS = re.compile("([pbm])[hjwy]?|([pb])[fvs]|[kgɡNŋ]([pbm])|m([pb])")
+"""Aspirated and palatalised ones, affricates, and what is said at two places at once."""
+
+
+def _closing(label: str) -> str | None:
+    """The p, b or m of a label without stress."""
+    letters = "".join(
+        c for c in unicodedata.normalize("NFD", label) if unicodedata.category(c) not in ("Mn", "Lm", "Sk")
+    )
+    letters = _OTHER_NAMES.get(letters, _DIACRITICS.sub("", letters))
+    match = _LETTERS.fullmatch(_OTHER_NAMES.get(letters, letters))
+    return next(filter(None, match.groups())) if match else None
+
+
+def closures(phonemes: Sequence[TimedPhoneme], frame_rate: float) -> list[tuple[int, int]]:
     """The frames in which the lips close for p, b and m, as `facediff.metrics.BilabialClosureRate` takes them.
 
     Returns:
@@ -137,19 +175,16 @@ def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPho
 def read_alignment(path: Path) -> list[TimedPhoneme]:
     """Phonemes in time from a TextGrid (``.TextGrid``), or a table as :func:`read_phonemes` reads it.
 
-    Labels may be IPA, also with marks, or ARPAbet with or without digits of stress.
+    A note says how many labels close the lips, as :func:`closing` understands them; those are p, b or m, and pauses are
+    empty.
     """
     if path.suffix.lower() == ".textgrid":
         phonemes = [TimedPhoneme(start, end, label) for start, end, label in phones_in(path)]
     else:
         phonemes = read_phonemes(path)
-    return [replace(phoneme, ipa=_plain_label(phoneme.ipa)) for phoneme in phonemes]
-
-
-def _plain_label(label: str) -> str:
-    """A label as IPA as far as the lips' closing goes: p, b, m without marks, nothing for a pause."""
-    label = label.strip()
-    if label.lower() in SILENCES:
-        return ""
-    bare = label.strip(STRESS).rstrip("ʰʲʷˠ̩̚ːˑ0123456789")
-    return bare.lower() if bare.lower() in BILABIALS else label
+    labels = ["" if phoneme.ipa.strip().lower() in SILENCES else phoneme.ipa.strip() for phoneme in phonemes]
+    closed = closing(labels)
+    count, sounding = sum(name is not None for name in closed), sum(map(bool, labels))
+    remedy = "" if count else "; expected p, b and m of the IPA, X-SAMPA or the ARPAbet"
+    note(f"{path}: {count} of {counted(sounding, 'label')} close the lips{remedy}")
+    return [replace(phoneme, ipa=name or label) for phoneme, name, label in zip(phonemes, closed, labels, strict=True)]

@@ -12,11 +12,33 @@ PHONES = ("phones", "phone", "phonemes", "phoneme", "mau", "segments", "segment"
 WORDS = ("words", "word", "ort", "ort-mau")
 """How tiers of phones and of words are called, alone or after the speaker's name (``84 - phones``)."""
 
-SILENCES = {"", "sil", "sp", "spn", "pau", "silence", "_", "<eps>", "<p>", "<p:>", "<p>:", "<sil>", "#"}
+SILENCES = {
+    "",
+    "sil",
+    "sp",
+    "spn",
+    "pau",
+    "silence",
+    "_",
+    "<eps>",
+    "<p>",
+    "<p:>",
+    "<p>:",
+    "<sil>",
+    "#",
+    "h#",
+    "epi",
+    "nsn",
+    "noise",
+    "laugh",
+}
 """Labels of pauses."""
 
 REMEDY = "align the recording again, with Praat or the Montreal Forced Aligner"
-_TOKEN = re.compile(r'"((?:[^"]|"")*)"|(<exists>|<absent>)|(?<![^\s=])([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?!\S)')
+# Praat leaves out all else, and what stands between an exclamation mark and the end of its line.
+_TOKEN = re.compile(
+    r'![^\r\n]*|"((?:[^"]|"")*)"|(<exists>|<absent>)|(?<![^\s=])([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?!\S)'
+)
 
 Interval = tuple[float, float, str]
 
@@ -42,34 +64,41 @@ def read_text_grid(path: Path) -> dict[str, list[Interval]]:
 
     Tiers of points are left out. The format is from Praat's manual, "TextGrid file formats".
     """
-    part = "its header"
+    part, tiers = "its header", dict[str, list[Interval]]()
     try:
-        content = path.read_bytes()
-        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
         # Both formats hold the same texts and numbers in the same order; the long one names each of them.
-        tokens = iter(_TOKEN.finditer(text))
-        long_form = (_text(tokens), _text(tokens)) == ("ooTextFile", "TextGrid")
+        tokens = (match for match in _TOKEN.finditer(_decoded(path.read_bytes())) if match.lastindex)
+        kind, content = _text(tokens).split()[0], _text(tokens)
+        if (kind, content) != ("ooTextFile", "TextGrid"):
+            raise ValueError(kind)
         _number(tokens), _number(tokens), next(tokens)
-        tiers: dict[str, list[Interval]] = {}
-        for _ in range(int(_number(tokens)) if long_form else 0):
+        for _ in range(int(_number(tokens))):
             kind, part = _text(tokens), f"tier {_text(tokens)}"
             _number(tokens), _number(tokens)
             intervals = [_interval(tokens, kind) for _ in range(int(_number(tokens)))]
             if kind != "IntervalTier":
                 continue
             edges = [0.0, *(edge for start, end, _ in intervals for edge in (start, end))]
-            long_form = all(later >= edge - 1e-6 for edge, later in zip(edges, edges[1:], strict=False))
-            if not long_form:
-                break
+            if not all(later >= edge - 1e-6 for edge, later in zip(edges, edges[1:], strict=False)):
+                raise ValueError(edges)
             tiers.setdefault(part.removeprefix("tier "), intervals)
-    except (OSError, StopIteration, ValueError, TypeError, AttributeError):  # a text where a number belongs, or none
-        long_form = False
-    if not long_form:
+    # A text where a number belongs, none, one beyond all counts, or an end.
+    except (OSError, StopIteration, ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as error:
         raise FaceDiffError(
-            f"{path}: {part} cannot be read, is cut short or goes back in time; expected a TextGrid in text format, "
-            f"UTF-8 or UTF-16; {REMEDY}"
-        )
+            f"{path}: {part} cannot be read, is cut short or goes back in time; expected a TextGrid in text format; "
+            f"{REMEDY}"
+        ) from error
     return tiers
+
+
+def _decoded(content: bytes) -> str:
+    """The text of a file: UTF-8 or UTF-16, and Latin-1 as Praat wrote it once."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
 
 
 def _interval(tokens: Iterator[re.Match[str]], kind: str) -> Interval:
