@@ -37,7 +37,7 @@ from facediff.utils.checksums import sha256
 from facediff.utils.files import cache_dir
 from facediff.utils.limits import COORDINATE, quoted
 from facediff.utils.pickles import load_pickle
-from facediff.utils.plain_files import read_table
+from facediff.utils.plain_files import read_columns, read_table
 
 LIP_PAIRS, EYELID_PAIRS = "regions/inner_lip_pairs.txt", "regions/eyelid_pairs.txt"
 """Where a corpus lists pairs of an upper and a lower vertex of the inner lips, and of the eyelids."""
@@ -401,18 +401,21 @@ def as_template(
     return array.reshape(n_vertices, 3)
 
 
+CLIP_COLUMNS = ("clip", "subject", "sentence", "split", "mood", "emotion", "intensity", "voice", "text")
+"""Columns of ``clips.csv`` that mean something; other columns are attributes of one's own."""
+
+
 def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
     """``clips.csv`` of a folder: the further columns of each clip; empty if there is none."""
     path = root / "clips.csv"
     if not path.is_file():
         return {}
     remedy = "save it as CSV UTF-8, with one row a clip"
-    rows = list(read_table(path, remedy=remedy))
-    header = rows.pop(0) if rows else []
+    header, rows = read_columns(path, CLIP_COLUMNS, remedy=remedy)
     table: dict[str, dict[str, str]] = {}
     for number, cells in enumerate(rows, 2):
-        row = {key: cell.strip() for key, cell in zip(header, cells, strict=False) if key}
-        fits = len(cells) >= len(header) and not any(cells[len(header) :]) and len(row) == len([*filter(None, header)])
+        row = {key: cell for key, cell in zip(header, cells, strict=False) if key}
+        fits = len(cells) >= len(header) and not any(cells[len(header) :])
         if not fits or not all(map(str.isprintable, row.values())) or row.get("clip") in (None, *table):
             raise FaceDiffError(
                 f"{path}: row {number} is {quoted(cells)}; expected {len(header)} printable cells with the column "

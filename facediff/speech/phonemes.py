@@ -86,7 +86,7 @@ def read_phonemes(path: Path) -> list[TimedPhoneme]:
                 row.get("viseme", ""),
                 row.get("word", "").strip(),
             )
-            for row in read_rows(path, remedy=expected)
+            for row in read_rows(path, ("start", "end", "ipa", "viseme", "word"), remedy=expected)
         ]
         if not phonemes or any(not (math.isfinite(p.end) and 0 <= p.start <= p.end) for p in phonemes):
             raise ValueError("has no phonemes, or one that starts below 0 or after its end")

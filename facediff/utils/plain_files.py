@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -146,28 +148,49 @@ def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
     """Rows of a CSV file from elsewhere, as lists of cells; empty lines are none.
 
     Args:
-        path: UTF-8, with or without the mark that spreadsheets put at the beginning.
+        path: UTF-8, or what spreadsheets save as Unicode text (UTF-16), with commas or tabs between cells, or with the
+            character of a first line such as ``sep=;``. Blanks around cells do not count.
         remedy: how messages end.
 
     Yields:
         the cells as :func:`csv_text` gives them; the header is the first.
     """
     with damaged(f"{path}: not readable as a UTF-8 table", remedy, OSError, csv.Error):
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.reader(stream))
+        content = path.read_bytes()
+        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        first, _, rest = text.partition("\n")
+        separator = ","
+        if (stated := re.fullmatch(r'"?sep=(.)"?\s*', first)) is not None:
+            separator, text = stated[1], rest
+        elif "\t" in first and "," not in first:
+            separator = "\t"
+        rows = list(csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=separator != "\t"))
         if rows and len(rows[0]) == 1 and ";" in rows[0][0]:
             raise ValueError("row 1 has semicolons between its columns, save it with commas")
-    yield from ([csv_text(cell) for cell in row] for row in rows if row)
+    yield from ([csv_text(cell.strip()) for cell in row] for row in rows if any(row))
 
 
-def read_rows(path: Path, *, remedy: str) -> Iterator[dict[str, str]]:
-    """Rows of a CSV file with a header, by column; cells that a row lacks are empty, and further ones are left out.
+def read_columns(path: Path, names: Iterable[str] = (), *, remedy: str) -> tuple[list[str], Iterator[list[str]]]:
+    """The header of a CSV file and its rows; a column that occurs twice is an error.
 
-    Arguments and errors are as for :func:`read_table`; a column that occurs twice is an error, too.
+    Args:
+        path: as :func:`read_table` takes it.
+        names: columns of which the case does not count; the header has them as they are here.
+        remedy: how messages end.
     """
     rows = read_table(path, remedy=remedy)
-    header = next(rows, [])
+    spelling = {name.casefold(): name for name in names}
+    header = [spelling.get(name.casefold(), name) for name in next(rows, [])]
     if columns := [name for name, count in Counter(filter(None, header)).items() if count > 1]:
         raise FaceDiffError(f'{path}: has the column "{columns[0]}" twice; {remedy}')
+    return header, rows
+
+
+def read_rows(path: Path, names: Iterable[str] = (), *, remedy: str) -> Iterator[dict[str, str]]:
+    """Rows of a CSV file with a header, by column; cells that a row lacks are empty, and further ones are left out.
+
+    Arguments and errors are as for :func:`read_columns`.
+    """
+    header, rows = read_columns(path, names, remedy=remedy)
     for row in rows:
         yield dict(zip(header, row + [""] * (len(header) - len(row)), strict=False))

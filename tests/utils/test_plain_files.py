@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facediff.data.corpus import read_clip_table
 from facediff.errors import FaceDiffError
 from facediff.utils.plain_files import load_json, parse_json, read_json, read_rows, write_rows
 
@@ -115,7 +116,7 @@ def test_tables_are_written_and_read_in_one_place() -> None:
         b"clip\n" + b'"' + b"x" * 200_000,  # beyond what a cell may hold
         b"clip,clip\na,b\n",
         b"clip\ncaf\xe9\n",
-        b"\xff\xfec\x00l\x00",
+        b"\xff\xfec\x00l",  # half a character
     ],
     ids=lambda content: repr(content[:12]),
 )
@@ -123,3 +124,35 @@ def test_tables_that_cannot_be_read_are_refused(content: bytes, tmp_path: Path) 
     (tmp_path / "clips.csv").write_bytes(content)
     with pytest.raises(FaceDiffError, match=r"clips\.csv: "):
         list(read_rows(tmp_path / "clips.csv", remedy="save it again"))
+
+
+TABLES = {
+    "blanks": b"clip, mood , split\nA_e01, calm ,train\n\n , , \nA_e02,lively, test\n",
+    "tabs": b"clip\tmood\tsplit\nA_e01\tcalm\ttrain\nA_e02\tlively\ttest\n",
+    "sep=,": b"sep=,\r\nclip,mood,split\r\nA_e01,calm,train\r\nA_e02,lively,test\r\n",
+    "sep=;": b"sep=;\nclip;mood;split\nA_e01;calm;train\nA_e02;lively;test\n",
+    "quoted sep": b'"sep=\t"\nclip\tmood\tsplit\nA_e01\tcalm\ttrain\nA_e02\tlively\ttest\n',
+    "mark": b"\xef\xbb\xbfclip,mood,split\nA_e01,calm,train\nA_e02,lively,test\n",
+    "mark and sep": b"\xef\xbb\xbfsep=,\nclip,mood,split\nA_e01,calm,train\nA_e02,lively,test\n",
+    "case": b"Clip,MOOD,Split\nA_e01,calm,train\nA_e02,lively,test\n",
+    "quotes": b'"clip", "mood","split"\n"A_e01", "calm","train"\n"A_e02","lively","test"\n',
+    "Unicode text": "\ufeffclip\tmood\tsplit\r\nA_e01\tcalm\ttrain\r\nA_e02\tlively\ttest\r\n".encode("utf-16-le"),
+    "empty columns": b"clip,mood,split,,\nA_e01,calm,train,,\nA_e02,lively,test,,\n,,,,\n",
+    "classic Mac": b"clip,mood,split\rA_e01,calm,train\rA_e02,lively,test\r",
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_are_read_as_people_write_them(name: str, tmp_path: Path) -> None:
+    (tmp_path / "clips.csv").write_bytes(TABLES[name])
+    expected = {"A_e01": {"mood": "calm", "split": "train"}, "A_e02": {"mood": "lively", "split": "test"}}
+    assert read_clip_table(tmp_path) == expected
+    rows = list(read_rows(tmp_path / "clips.csv", ("clip", "mood", "split"), remedy=""))
+    assert {row["clip"]: {"mood": row["mood"], "split": row["split"]} for row in rows} == expected
+
+
+@pytest.mark.parametrize("header", ["clip,mood,mood", "clip,split,Split", "Clip,clip,mood", "clip, mood,mood "])
+def test_a_column_that_occurs_twice_is_refused(header: str, tmp_path: Path) -> None:
+    (tmp_path / "clips.csv").write_text(f"{header}\na,b,c\n")
+    with pytest.raises(FaceDiffError, match="twice"):
+        read_clip_table(tmp_path)

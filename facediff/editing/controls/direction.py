@@ -23,7 +23,7 @@ from facediff.spaces.arkit import ARKIT
 from facediff.utils import ranges
 from facediff.utils.hints import Range, check_number, shown
 from facediff.utils.limits import FRAME_RATES, check_format, quoted
-from facediff.utils.plain_files import json_text, load_json, parse_json, read_table, write_json, write_rows
+from facediff.utils.plain_files import json_text, load_json, parse_json, read_columns, write_json, write_rows
 from facediff.utils.records import read_record
 
 if TYPE_CHECKING:
@@ -382,13 +382,12 @@ def direction_file(folder: Path, recording: Path) -> Path | None:
 def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Rows of a table with their numbers as a spreadsheet counts them; empty cells are left out."""
     remedy = "expected a table with the columns time (or frame), channel, value and interpolation"
-    rows = read_table(path, remedy=remedy)
-    header = [name.strip().lower() for name in next(rows, [])]
-    if not {"channel", "value"} <= set(header) <= set(COLUMNS) or len(set(header)) < len(header):
-        raise FaceDiffError(f"{path}: row 1: has the columns {quoted(header)}; {remedy}, each once")
+    header, rows = read_columns(path, COLUMNS, remedy=remedy)
+    if not {"channel", "value"} <= set(header) <= set(COLUMNS):
+        raise FaceDiffError(f"{path}: row 1: has the columns {quoted(header)}; {remedy}")
     for number, row in enumerate(rows, 2):
         # A cell beyond the header gets an empty name, which is refused as an unknown field.
-        cells = {name: cell.strip() for name, cell in zip_longest(header, row, fillvalue="") if cell.strip()}
+        cells = {name: cell for name, cell in zip_longest(header, row, fillvalue="") if cell}
         if cells:
             yield number, cells
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from facediff.errors import FaceDiffError, damaged
 from facediff.spaces.arkit import ARKIT
-from facediff.spaces.files.clips import ParameterClip, checked
+from facediff.spaces.files.clips import ParameterClip, checked, refuse_gaps
 from facediff.spaces.files.csv_files import rate_of
 from facediff.spaces.layouts import LAYOUTS, layout
 from facediff.spaces.space import Space
@@ -42,6 +42,8 @@ def read_beat(path: Path) -> ParameterClip:
         rate = rate_of(times)
     else:
         rate = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
+    if times is not None:
+        refuse_gaps(path, times, rate, [f"frame {number}" for number in range(len(times))])
     start = 0.0 if times is None or not len(times) else float(times[0])
     after = None if times is None else times - start
     if after is not None and np.abs(after - np.arange(len(after)) / rate).max(initial=0.0) < 0.25 / rate:

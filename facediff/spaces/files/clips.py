@@ -18,6 +18,9 @@ from facediff.utils.limits import FRAME_RATES
 Values = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
 
+MOST_MISSING = 3600
+"""Frames that may be missing between two rows, a minute at 60 a second; they are interpolated."""
+
 LARGEST = 1e6
 """Largest absolute value of a channel; weights, radians and coefficients in standard deviations are far below."""
 
@@ -84,10 +87,21 @@ def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> 
 
 
 def columns_of(path: Path, header: Sequence[str], space: Space) -> list[int]:
-    """The column of each channel of a space in a header, without regard to case."""
-    columns = {name.strip().casefold(): index for index, name in reversed(list(enumerate(header)))}
+    """The column of each channel of a space in a header."""
+    columns = {name: index for index, name in enumerate(header)}
     with damaged(path, f"expected columns of {len(space.channels)} channels"):
-        return [columns[name.casefold()] for name in space.channels]
+        return [columns[name] for name in space.channels]
+
+
+def refuse_gaps(path: Path, times: Array, frame_rate: float, places: Sequence[str]) -> None:
+    """Refuse times (T,) between which more frames are missing than a recorder drops; ``places`` name the rows."""
+    missing = np.diff(times) * frame_rate
+    if len(missing) and missing.max() > MOST_MISSING:
+        at = int(missing.argmax())
+        raise FaceDiffError(
+            f"{path}: {places[at + 1]} comes {times[at + 1] - times[at]:.0f} s after {places[at]}; cut the recording "
+            f"there, or correct its time"
+        )
 
 
 def shortest(value: np.float32) -> str:

@@ -10,22 +10,24 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, damaged
+from facediff.errors import FaceDiffError, damaged, note
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
-from facediff.spaces.files.clips import Array, ParameterClip, checked, columns_of, shortest
+from facediff.spaces.files.clips import Array, ParameterClip, checked, columns_of, refuse_gaps, shortest
 from facediff.spaces.layouts import layout
 from facediff.spaces.operations import permuted
 from facediff.utils.files import atomic
 from facediff.utils.limits import quoted
-from facediff.utils.plain_files import read_table, write_table
+from facediff.utils.plain_files import read_columns, write_table
 
 Values = npt.NDArray[np.floating]
 
 DAY = 24 * 3600
-COUNT = "blendshapecount"
+TIMECODE, COUNT = "Timecode", "BlendShapeCount"
 REMEDY = "expected a table as Live Link Face or Audio2Face writes it"
 SIXTIETHS = 60
 """Unit of the last field of a timecode, as parts of a second; it does not depend on the recorded rate."""
+COUNTED = (24, 25, 30, 48, 50)
+"""Frames a second that programs count in that field."""
 USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
 NEAR_RATE = 0.01
 """Share by which the rate of a table's rows may differ from a usual one and still be it."""
@@ -42,7 +44,7 @@ _TIMECODE = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2})[:;](\d{1,2}(?:\.\d{1,9})?
 
 def live_link_header() -> list[str]:
     """The columns of a recording: timecode, number of values, ARKit's 52 names, rotations of head and eyes."""
-    return ["Timecode", "BlendShapeCount", *map(live_link_name, ARKIT), *ROTATIONS]
+    return [TIMECODE, COUNT, *map(live_link_name, ARKIT), *ROTATIONS]
 
 
 def timecode(seconds: float) -> str:
@@ -63,6 +65,12 @@ def seconds_of(text: str) -> float | None:
         >>> seconds_of("00:00:01:30.000"), seconds_of("1:30")
         (1.5, None)
     """
+    fields = _fields(text)
+    return None if fields is None else fields[0] + fields[1] / SIXTIETHS
+
+
+def _fields(text: str) -> tuple[int, float] | None:
+    """Whole seconds since midnight of a timecode, and its last field; None for anything else."""
     match = _TIMECODE.fullmatch(text.strip())
     if match is None:
         return None
@@ -70,7 +78,26 @@ def seconds_of(text: str) -> float | None:
     parts = float(match[4])
     if hours > 23 or minutes > 59 or seconds > 59 or parts >= SIXTIETHS:
         return None
-    return hours * 3600 + minutes * 60 + seconds + parts / SIXTIETHS
+    return hours * 3600 + minutes * 60 + seconds, parts
+
+
+def _clock(path: Path, stamps: Array) -> Array:
+    """Seconds (T,) from midnight on of whole seconds and last fields (T, 2); past midnight, the clock begins again.
+
+    The app counts sixtieths in the last field, other programs frames: where a second ends, it begins again at their
+    number.
+    """
+    seconds = stamps[:, 0] + DAY * np.cumsum(np.diff(stamps[:, 0], prepend=stamps[:1, 0]) < -DAY / 2)
+    parts, unit, steps = stamps[:, 1], SIXTIETHS, np.diff(seconds)
+    if (steps == 1).any() and (steps == 0).any():
+        after = np.diff(parts)
+        # A program may drop rows, also where a second ends.
+        turn = float(np.median(after[steps == 0])) - float(np.median(after[steps == 1]))
+        unit = next((rate for rate in COUNTED if rate > np.floor(parts.max()) and abs(rate - turn) < 0.5), SIXTIETHS)
+    if unit != SIXTIETHS:
+        note(f"{path}: the last field of its timecodes counts frames, {unit} a second")
+        parts = np.floor(parts)
+    return np.asarray(seconds + parts / unit)
 
 
 def rate_of(times: Array) -> float:
@@ -89,7 +116,9 @@ def _rate(path: Path, times: Array, numbers: Sequence[int]) -> float:
     if len(times) < 2 or not later.all():
         row = f"row {numbers[int(np.argmin(later))]}" if len(times) else "the table"
         raise FaceDiffError(f"{path}: {row} is no later than the one before it, or alone; expected times that ascend")
-    return rate_of(times)
+    rate = rate_of(times)
+    refuse_gaps(path, times, rate, [f"row {number}" for number in numbers])
+    return rate
 
 
 def gaze(names: Sequence[str], weights: Values) -> Array:
@@ -127,32 +156,32 @@ def read_live_link(path: Path) -> ParameterClip:
     Args:
         path: the table.
     """
-    rows = read_table(path, remedy=REMEDY)
-    header = next(rows, [])
-    folded = [name.strip().casefold() for name in header]
-    if "timecode" not in folded or COUNT not in folded:
-        raise FaceDiffError(f"{path}: has no columns Timecode and BlendShapeCount; {REMEDY}")
     space = layout("live_link")
-    lacking = [name for name in space.channels if name.casefold() not in folded]
+    header, rows = read_columns(path, (TIMECODE, COUNT, *space.channels), remedy=REMEDY)
+    if not {TIMECODE, COUNT} <= {*header}:
+        raise FaceDiffError(f"{path}: has no columns {TIMECODE} and {COUNT}; {REMEDY}")
+    lacking = [name for name in space.channels if name not in header]
     # Rotations are the one part that the app can leave out, and tongueOut came with a later version.
     if lacking and set(lacking) <= {*ROTATIONS, "tongueOut"}:
-        folded, header = [*folded, *(name.casefold() for name in lacking)], [*header, *lacking]
+        header = [*header, *lacking]
     columns = columns_of(path, header, space)
-    at_time = folded.index("timecode")
+    at_time = header.index(TIMECODE)
     times, values, numbers = [], [], []
     for number, row in enumerate(rows, start=2):
-        if not any(cell.strip() for cell in row[2:]):
+        if not any(row[2:]):
             continue  # a frame in which the phone saw no face: its row has a timecode and nothing else
-        seconds = seconds_of(row[at_time]) if len(row) > at_time else None
-        if seconds is None:
+        stamp = _fields(row[at_time]) if len(row) > at_time else None
+        if stamp is None:
             raise FaceDiffError(
                 f"{path}: row {number} has the timecode {quoted(row[at_time : at_time + 1])}; expected "
                 f"hours:minutes:seconds:sixtieths"
             )
-        times.append(seconds)
+        times.append(stamp)
         numbers.append(number)
         values.append(_numbers(path, number, [*row, *("0" for _ in lacking)], columns, len(header)))
-    return _timed(path, np.array(times), _with_mirrored(np.array(values)), lacking, numbers)
+    return _timed(
+        path, _clock(path, np.array(times).reshape(-1, 2)), _with_mirrored(np.array(values)), lacking, numbers
+    )
 
 
 def mirrored(rotations: Values) -> Values:
@@ -171,8 +200,6 @@ def _with_mirrored(values: Values) -> Values:
 
 
 def _timed(path: Path, clock: Array, values: Values, lacking: list[str], numbers: list[int]) -> ParameterClip:
-    # Past midnight the clock begins again.
-    clock = clock + DAY * np.cumsum(np.diff(clock, prepend=clock[:1]) < -DAY / 2)
     rate = _rate(path, clock, numbers)
     space = layout("live_link")
     space = replace(space, absent=(*space.absent, *lacking))
@@ -212,18 +239,15 @@ def read_audio2face(path: Path) -> ParameterClip:
     Args:
         path: the table.
     """
-    rows = read_table(path, remedy=REMEDY)
-    header = next(rows, [])
-    folded = [name.strip().casefold() for name in header]
-    shapes = [name.strip()[len(PREFIX) :] for name in header if name.strip().casefold().startswith(PREFIX.casefold())]
-    if "timecode" not in folded or not shapes:
-        raise FaceDiffError(f"{path}: has no columns timeCode and {PREFIX}jawOpen …; {REMEDY}")
     space = layout("audio2face")
-    names = [name.strip()[len(PREFIX) :] if name.strip()[len(PREFIX) :] in shapes else "" for name in header]
-    lacking = [name for name in space.channels if name.casefold() not in {one.casefold() for one in shapes}]
-    columns = columns_of(path, [*names, *lacking], space)
+    header, rows = read_columns(path, ("timeCode", *(PREFIX + name for name in space.channels)), remedy=REMEDY)
+    shapes = [name.removeprefix(PREFIX) for name in header if name.startswith(PREFIX)]
+    if "timeCode" not in header or not shapes:
+        raise FaceDiffError(f"{path}: has no columns timeCode and {PREFIX}jawOpen …; {REMEDY}")
+    lacking = [name for name in space.channels if name not in shapes]
+    columns = columns_of(path, [*(name.removeprefix(PREFIX) for name in header), *lacking], space)
     wide = len(header) + len(lacking)
-    at_time = folded.index("timecode")
+    at_time = header.index("timeCode")
     values = []
     times = []
     for number, row in enumerate(rows, start=2):

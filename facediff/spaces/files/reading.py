@@ -17,7 +17,7 @@ from facediff.spaces.files.csv_files import (
     write_live_link,
 )
 from facediff.utils.hdf5 import HDF5_SUFFIXES
-from facediff.utils.plain_files import read_table
+from facediff.utils.plain_files import read_columns
 
 ARRAYS = (".npy", ".npz", ".pt", *HDF5_SUFFIXES)
 """Files of arrays, which need a declared layout."""
@@ -41,8 +41,8 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
     refuse_idle(f"{path} names its columns itself", layout=layout is not None)
     if suffix == ".json":
         return read_beat(path)
-    header = next(read_table(path, remedy=REMEDY), [])
-    is_live_link = any(name.strip().casefold() == COUNT for name in header)
+    header, _ = read_columns(path, (COUNT,), remedy=REMEDY)
+    is_live_link = COUNT in header
     return read_live_link(path) if is_live_link else read_audio2face(path)
 
 

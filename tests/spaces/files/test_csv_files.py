@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, Note
 from facediff.spaces import layout
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.files import ParameterClip, even, read_parameters, write_parameters
@@ -137,3 +139,89 @@ def test_every_arkit_order_reaches_a_live_link_table(tmp_path: Path) -> None:
     flame = ParameterClip("f", np.zeros((3, 106), np.float32), layout("flame_artalk"), 25.0)
     with pytest.raises(FaceDiffError, match="flame"):
         write_parameters(tmp_path / "t.csv", replace(flame, name="g"))
+
+
+def coded(rows: int, rate: int, counted: float, first: int = 0) -> list[str]:
+    """Timecodes of rows at a rate, with the last field in parts of a second; ``first`` is the first row's number."""
+    codes = []
+    for row in range(first, first + rows):
+        second, frame = divmod(row % (24 * 3600 * rate), rate)
+        codes.append(f"{second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}:{frame * counted / rate:06.3f}")
+    return codes
+
+
+def write_sine(path: Path, codes: list[str], rate: int) -> np.ndarray:
+    names = [*map(live_link_name, ARKIT), *ROTATIONS]
+    values = np.zeros((len(codes), 61))
+    values[:, names.index("JawOpen")] = 0.3 + 0.3 * np.sin(np.pi * np.arange(len(codes)) / rate)
+    rows = [f"{code},61," + ",".join(f"{value:.8f}" for value in row) for code, row in zip(codes, values, strict=True)]
+    path.write_text("\n".join([",".join(["Timecode", "BlendShapeCount", *names]), *rows]))
+    return values[:, names.index("JawOpen")]
+
+
+@pytest.mark.parametrize("first", [0, 1, 17, -30])
+@pytest.mark.parametrize("rate", [24, 25, 30, 48, 50, 60])
+def test_timecodes_that_count_frames_are_read_at_their_rate(rate: int, first: int, tmp_path: Path) -> None:
+    path = tmp_path / "take.csv"
+    jaw = write_sine(path, coded(2 * rate + 6, rate, rate, first), rate)
+    with pytest.warns(Note, match=f"counts frames, {rate} a second") if rate < 60 else nullcontext():
+        clip = read_parameters(path)
+    assert clip.frame_rate == rate
+    assert clip.dropped == 0
+    found = even(clip)
+    np.testing.assert_allclose(found.values[:, found.space.index("jawOpen")], jaw, atol=1e-6)
+
+
+@pytest.mark.parametrize("rate", [24, 25, 30, 48, 50, 60])
+def test_timecodes_of_sixtieths_stay_sixtieths(rate: int, tmp_path: Path) -> None:
+    jaw = write_sine(tmp_path / "take.csv", coded(2 * rate + 6, rate, 60, 7), rate)
+    clip = read_parameters(tmp_path / "take.csv")
+    assert clip.frame_rate == rate
+    np.testing.assert_allclose(even(clip).values[:, clip.space.index("jawOpen")], jaw, atol=1e-3)
+
+
+def test_frames_that_are_counted_may_be_dropped(tmp_path: Path) -> None:
+    codes = [code for number, code in enumerate(coded(96, 30, 30)) if number % 7]
+    codes[20] = codes[20].removesuffix(".000") + ".020"  # parts of a frame
+    write_sine(tmp_path / "take.csv", codes, 30)
+    with pytest.warns(Note, match="30 a second"):
+        clip = read_parameters(tmp_path / "take.csv")
+    assert (clip.frame_rate, clip.dropped) == (30.0, 13)
+
+
+@pytest.mark.parametrize("form", ["live link", "audio2face", "beat"])
+def test_a_gap_of_hours_is_refused_by_its_row(form: str, tmp_path: Path) -> None:
+    path = tmp_path / ("take.json" if form == "beat" else "take.csv")
+    if form == "live link":
+        write_sine(path, [*coded(9, 60, 60), "13:00:00:00.000"], 60)
+    elif form == "audio2face":
+        names = [f"blendShapes.{name}" for name in layout("audio2face").channels]
+        rows = [f"{time}," + ",".join("0" * len(names)) for time in (0, 1 / 60, 2 / 60, 99_000)]
+        path.write_text("\n".join([",".join(["timeCode", *names]), *rows]))
+    else:
+        frames = [{"weights": [0.0] * 52, "time": time} for time in (0.0, 0.01, 21_599.0)]
+        path.write_text(json.dumps({"names": list(ARKIT), "frames": frames, "metadata": {"fps": 138}}))
+    where = {"live link": "row 11", "audio2face": "row 5", "beat": "frame 2"}[form]
+    with pytest.raises(FaceDiffError, match=rf"{where} comes \d+ s after"):
+        read_parameters(path)
+
+
+@pytest.mark.parametrize("column", ["JawOpen", "jawopen", "Timecode", "timecode ", " BlendShapeCount"])
+def test_a_column_twice_is_refused(column: str, tmp_path: Path) -> None:
+    path = write_take(tmp_path / "take.csv")
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([f"{header},{column}", *(f"{row},0" for row in rows)]))
+    with pytest.raises(FaceDiffError, match="twice"):
+        read_parameters(path)
+
+
+@pytest.mark.parametrize("form", ["sep=,\n{}", "\ufeff{}", "\ufeffsep=,\r\n{}", "tabs", "blanks", "case"])
+def test_live_link_tables_are_read_as_people_save_them(form: str, tmp_path: Path) -> None:
+    path = write_take(tmp_path / "take.csv")
+    expected = read_parameters(path)
+    text = path.read_text()
+    changes = {"tabs": text.replace(",", "\t"), "blanks": text.replace(",", " , "), "case": text.upper()}
+    path.write_text(changes.get(form) or form.format(text), encoding="utf-8")
+    found = read_parameters(path)
+    np.testing.assert_array_equal(found.values, expected.values)
+    assert found.frame_rate == expected.frame_rate
