@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypedDict, Type
 from facediff.errors import OptionError, choices
 from facediff.utils import ranges
 from facediff.utils.option import Option
+from facediff.utils.paths import from_home
 
 Scales = str | float | Mapping[str, float]
 """One number, or numbers by name: a mapping, or text as the command line takes it (``lips=0.5,all=1``)."""
@@ -56,9 +57,11 @@ def scales_text(scales: Scales) -> str:
 
 
 class CheckedOptions:
-    """Base of the groups of options: checks ranges, and tells which options were changed."""
+    """Base of the groups of options: checks ranges, finds the user's home, and tells which options were changed."""
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, from_home(value))
         ranges.check_options(self)
 
     @classmethod

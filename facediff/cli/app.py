@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import facediff
 from facediff.cli import process
 from facediff.errors import FaceDiffError, MissingExtraError, choices, import_failure
+from facediff.utils.paths import from_home
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -210,6 +211,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def answer(arguments: Sequence[str]) -> int:
     """Run a command, and report an error in one sentence; the exit status."""
+    arguments = [from_home(word) for word in arguments]
     name = arguments[0] if arguments else ""
     try:
         try:

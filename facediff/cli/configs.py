@@ -15,6 +15,7 @@ import yaml
 from facediff.errors import FaceDiffError
 from facediff.registry import with_paths
 from facediff.utils.files import config_dir
+from facediff.utils.paths import from_home
 from facediff.utils.yaml_files import check_yaml, yaml_text
 
 
@@ -86,18 +87,20 @@ def as_parts(arguments: Sequence[str]) -> list[str]:
     return parts
 
 
-def with_bundled(content: Any) -> Any:  # noqa: ANN401
-    """A config's content with the bundled files that it names, unless the user has files at these places."""
+def with_files(content: Any) -> Any:  # noqa: ANN401
+    """A config's content with the user's home in its paths, and the bundled files that the user does not have."""
     from jsonargparse.typing import Path_fr
 
     if isinstance(content, dict):
-        return {key: with_bundled(value) for key, value in content.items()}
+        return {key: with_files(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [with_files(value) for value in content]
     if isinstance(content, str) and content.startswith("configs/"):
         try:
             Path_fr(content)  # relative to the file that names it, as jsonargparse reads it
         except TypeError:
             return str(bundled_config(content) or content)
-    return content
+    return from_home(content)
 
 
 def guard_configs(mode: str) -> None:
@@ -117,6 +120,6 @@ def guard_configs(mode: str) -> None:
                 if isinstance(error.__cause__, yaml.YAMLError):  # jsonargparse then tries other types
                     raise error.__cause__ from error
                 raise
-        return with_paths(without_removed_options(with_bundled(read(text)), "--config"))
+        return with_paths(without_removed_options(with_files(read(text)), "--config"))
 
     set_loader(mode, load, exceptions=(yaml.YAMLError,))

@@ -16,6 +16,7 @@ from facediff.spaces.operations import at_times, permuted
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
+from facediff.utils.paths import existing, name_of_file
 
 USUAL_SUFFIXES = (".csv", ".json")
 
@@ -50,18 +51,19 @@ class RecordingFolder(ChannelFolder):
     @cached_property
     def files(self) -> dict[str, tuple[Path, Path]]:
         """The files with values and speech of each recording, by name, sorted."""
-        sounds = {path.stem: path for path in (self.root / "wav").glob("*") if path.suffix.lower() == ".wav"}
+        sounds = {name_of_file(path): path for path in (self.root / "wav").glob("*") if path.suffix.lower() == ".wav"}
         files: dict[str, tuple[Path, Path]] = {}
         for path in sorted(self.root.rglob("*")):
             if path.suffix.lower() not in self.suffixes or path.name.startswith(".") or not path.is_file():
                 continue
-            beside = (path.with_suffix(suffix) for suffix in (".wav", ".WAV"))
-            sound = next((sound for sound in beside if sound.is_file()), sounds.get(path.stem))
+            name = name_of_file(path)
+            beside = (existing(path.with_suffix(suffix)) for suffix in (".wav", ".WAV"))
+            sound = next((sound for sound in beside if sound.is_file()), sounds.get(name))
             if sound is None or not sound.is_file():
                 continue
-            if path.stem in files:
-                raise FaceDiffError(f"{path}: is named as {files[path.stem][0]} is; rename one of them")
-            files[path.stem] = (path, sound)
+            if name in files:
+                raise FaceDiffError(f"{path}: is named as {files[name][0]} is; rename one of them")
+            files[name] = (path, sound)
         return files
 
     def names(self) -> list[str]:

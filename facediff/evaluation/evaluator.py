@@ -42,6 +42,7 @@ from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import SAMPLE_RATE, read_speech
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges
+from facediff.utils.paths import existing, name_of_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +190,7 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
         scales=scales,
     )
     tables = score_methods(methods, Path(truth), truths, scorer, scoring, suffixes)
-    clips = {pair.truth.path.stem for table in tables for pair, _ in table.rows}
+    clips = {name_of_file(pair.truth.path) for table in tables for pair, _ in table.rows}
     attributes = attributes_of(scoring.corpus, clips, scoring.by) if scoring.by else {}
     by_name = {request.text: metrics[request.text] for request in parse_all(scoring.metrics)}
     results = [table.result(sampling, attributes) for table in tables]
@@ -259,7 +260,7 @@ def score_renders(
         raise FaceDiffError(f"--render draws motion, and lacks {lacking}; give it")
 
     def speech(clip: str) -> npt.NDArray[np.float32]:
-        path = None if options.corpus is None else options.corpus / "wav" / f"{clip}.wav"
+        path = None if options.corpus is None else existing(options.corpus / "wav" / f"{clip}.wav")
         return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
 
     drawing = RenderScorer(
@@ -272,7 +273,7 @@ def score_renders(
             vertices = truth.get(channels=False)
             neutral = scorer.templates.get(pair.truth.name.subject, truth.template)
             template = (vertices.double().mean(0) if neutral is None else neutral.double()).numpy()
-            clip = pair.truth.path.stem
+            clip = name_of_file(pair.truth.path)
             files = [scorer.read(path, 1).get(channels=False) for path in pair.predictions.values()]
             scores = [drawing.score(clip, motion.double().numpy(), template) for motion in files]
             rows.setdefault(table.name, {})[clip] = means(scores)
@@ -350,13 +351,13 @@ class CorpusInputs:
         """The inputs of one clip, by the names of the metrics' arguments."""
         inputs: dict[str, Any] = {}
         corpus, rate, stride = self.options.corpus, self.options.frame_rate, self.options.truth_stride
-        clip = pair.truth.path.stem
+        clip = name_of_file(pair.truth.path)
         if "identities" in needed:
             inputs["identities"] = [self.identities.index(pair.truth.name.subject)]
         if corpus is None:
             return inputs
         if "speech" in needed:
-            inputs["waveform"] = torch.from_numpy(read_speech(corpus / "wav" / f"{clip}.wav"))
+            inputs["waveform"] = torch.from_numpy(read_speech(existing(corpus / "wav" / f"{clip}.wav")))
         if "closures" in needed and rate is not None:
             file = phonemes_file(corpus, clip)
             inputs["closures"] = [] if file is None else closures(read_phonemes(file), rate)

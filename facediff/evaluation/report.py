@@ -16,6 +16,7 @@ from facediff.evaluation.scoring import METRICS, ClipScores, Column
 from facediff.metrics import Region
 from facediff.reporting.scores import ScoreMatrix
 from facediff.reporting.statistics import Bootstrap, Interval
+from facediff.utils.paths import name_of_file
 from facediff.utils.provenance import Provenance, read_provenance
 from facediff.utils.text_tables import format_table
 
@@ -219,8 +220,8 @@ class MethodTable:
         """The scores of clips with equal attributes, by the name of the truth's file; pooled as over all clips."""
         clips: dict[tuple[tuple[str, str], ...], list[str]] = {}
         for pair, _ in self.rows:
-            if pair.truth.path.stem in attributes:
-                clips.setdefault(tuple(attributes[pair.truth.path.stem].items()), []).append(pair.clip)
+            if name_of_file(pair.truth.path) in attributes:
+                clips.setdefault(tuple(attributes[name_of_file(pair.truth.path)].items()), []).append(pair.clip)
         return [
             GroupScores(self.name, dict(key), len(names), self._by_name(self.table.at(names).pool().tolist()))
             for key, names in sorted(clips.items())
@@ -248,7 +249,7 @@ class MethodTable:
                 scored.cut_prediction,
                 scored.cut_truth,
                 self._by_name(scored.values),
-                (attributes or {}).get(pair.truth.path.stem, {}),
+                (attributes or {}).get(name_of_file(pair.truth.path), {}),
             )
             for pair, scored in self.rows
         ]

@@ -32,6 +32,7 @@ from facediff.utils.hints import check_number
 from facediff.utils.hub import EXPECTED_TO_ANIMATE, check_animating_source, is_audio2face, is_exported, model_or_bundled
 from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import SAMPLE_RATES
+from facediff.utils.paths import from_home
 
 if TYPE_CHECKING:
     import numpy as np
@@ -121,7 +122,8 @@ def import_checkpoint(
     from facediff.models import import_checkpoint as import_model
     from facediff.pipelines.trained import usable_device
 
-    first = Path(paths) if isinstance(paths, str | Path) else Path(next(iter(paths)))
+    paths = [from_home(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
+    first = Path(paths[0])
     return Animator(import_model(paths, **options).to(usable_device(device)), first)
 
 
@@ -628,6 +630,7 @@ def recordings_of(speech: Any) -> list[Any] | None:  # noqa: ANN401 - speech in 
     Raises:
         FaceDiffError: if there is none.
     """
+    speech = from_home(speech)
     if isinstance(speech, str | Path) and Path(speech).is_dir():
         from facediff.pipelines.folder import recordings
 

@@ -20,6 +20,7 @@ from facediff.animation.options import AnimationControls, ExportKeywords, Export
 from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.utils import ranges
 from facediff.utils.hub import bundled_by_name, is_graphs
+from facediff.utils.paths import from_home
 
 if TYPE_CHECKING:
     from facediff.editing.blendshapes import SolveOptions, Weights
@@ -38,8 +39,9 @@ def save(animations: Sequence[Animation], path: str | Path, options: ExportKeywo
     from facediff.export import check_used, write_animations
 
     settings = {name: value for name, value in options.items() if value is not None}
-    check_used(Path(path).suffix, settings)
-    return write_animations(Path(path), animations, ExportOptions(**settings))  # type: ignore[arg-type]  # of a TypedDict
+    path = Path(from_home(path))
+    check_used(path.suffix, settings)
+    return write_animations(path, animations, ExportOptions(**settings))  # type: ignore[arg-type]  # of a TypedDict
 
 
 def compare(
@@ -290,7 +292,7 @@ def read(
         >>> truth = facediff.read("vertices_npy/F1_e28.npy", like=animation)  # doctest: +SKIP
     """
     options = SourceOptions(mesh, checkpoint, identity, speech, frame_rate, unit)
-    return SourceReader(options).read(Path(path), like)
+    return SourceReader(options).read(Path(from_home(path)), like)
 
 
 class SourceReader:

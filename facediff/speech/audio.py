@@ -31,6 +31,7 @@ from facediff.utils import SAMPLE_RATE as SAMPLE_RATE
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.hints import check_number
 from facediff.utils.limits import SAMPLE_RATES, brief
+from facediff.utils.paths import from_home
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -499,7 +500,7 @@ def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | No
     if isinstance(speech, str | Path | tuple) or hasattr(speech, "read"):
         refuse_idle("a recording and a pair have their own", rate=rate is not None)
     if isinstance(speech, str | Path):
-        return read_recording(Path(speech), max_seconds)
+        return read_recording(Path(from_home(speech)), max_seconds)
     if hasattr(speech, "read"):
         file = cast("IO[bytes]", speech)
         path = file.name if isinstance(getattr(file, "name", None), str) else "speech"

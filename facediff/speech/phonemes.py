@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from facediff.errors import counted, damaged, note
 from facediff.speech.text_grids import SILENCES, phones_in
+from facediff.utils.paths import existing
 from facediff.utils.plain_files import read_rows
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def phonemes_text(phonemes: Iterable[TimedPhoneme]) -> str:
 
 def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
     """Where a corpus has a clip's phonemes; None if it has none."""
-    path = None if corpus is None else corpus / "phonemes" / f"{clip}.csv"
+    path = None if corpus is None else existing(corpus / "phonemes" / f"{clip}.csv")
     return path if path is not None and path.is_file() else None
 
 

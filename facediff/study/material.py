@@ -21,6 +21,7 @@ from facediff.evaluation.file_pairs import DEFAULT_PATTERNS, OWN, NamePattern
 from facediff.mesh import read_mesh
 from facediff.speech.audio import CONTAINERS, SUFFIXES, read_sound_to_play
 from facediff.study.design import STILL, TRUTH
+from facediff.utils.paths import existing, name_of_file
 
 ANIMATIONS = (".npz", ".npy")
 UNEQUAL = 0.1
@@ -189,7 +190,7 @@ class StudyAnimations:
         for clip, found_truth in corpus.truths.items():
             self._subjects[clip] = found_truth.name.subject
             if self.speech is None and corpus.corpus is not None:
-                sound = corpus.corpus / "wav" / f"{found_truth.path.stem}.wav"
+                sound = existing(corpus.corpus / "wav" / f"{found_truth.path.stem}.wav")
                 if sound.is_file():
                     self._sounds[clip] = sound
         return {
@@ -274,7 +275,7 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
     speakers: dict[str, str] = {}
     for file in files:
         read = pattern.match(file.stem)
-        clip, condition = (read.clip, read.identity) if read is not None else (file.stem, None)
+        clip, condition = (read.clip, read.identity) if read is not None else (name_of_file(file), None)
         conditions = by_clip.setdefault(clip, {})
         if condition in conditions:
             raise FaceDiffError(f"{file}: is of the same clip as {conditions[condition]}; keep one of them")
@@ -302,7 +303,8 @@ def find_animations(folder: Path, subjects: Sequence[str] = (), identity: str = 
 def _recordings(folder: Path) -> dict[str, Path]:
     """Recordings of a folder by their names without the suffix."""
     inside = sorted(folder.iterdir()) if folder.is_dir() else []
-    recordings = {file.stem: file for file in inside if file.suffix.lower() in SUFFIXES + CONTAINERS}
+    inside = [file for file in inside if not file.name.startswith(".")]
+    recordings = {name_of_file(file): file for file in inside if file.suffix.lower() in SUFFIXES + CONTAINERS}
     if not recordings:
         raise FaceDiffError(
             f"--speech {folder}: holds no recording; expected a folder of {', '.join(SUFFIXES)}, named like the clips"

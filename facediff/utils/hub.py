@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 from facediff.errors import FaceDiffError, damaged, needs_extra
 from facediff.utils.checksums import sha256
+from facediff.utils.paths import from_home
 
 CONFIG, WEIGHTS, ASSETS, CARD = "config.json", "model.safetensors", "assets.npz", "README.md"
 BUNDLED = Path(__file__).parents[1] / "bundled" / "puppet"
@@ -142,7 +143,7 @@ def check_animating_source(source: str | os.PathLike[str]) -> None:
 
 def model_or_bundled(source: Source | None) -> Source | Path:
     """The model of a name, or the one that comes with facediff, of which a line then tells."""
-    model_or_name = BUNDLED if source is None else bundled_by_name(source)
+    model_or_name = BUNDLED if source is None else bundled_by_name(from_home(source))
     if model_or_name is BUNDLED and not is_exported(BUNDLED):
         raise FaceDiffError(f"--checkpoint: missing, and this copy of facediff has no model at {BUNDLED}; {EXPECTED}")
     if source is not None:

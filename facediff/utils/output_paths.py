@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
+from facediff.utils.paths import from_home
 
 DATA_SUFFIXES = frozenset(
     [".npy", ".npz", ".pkl", ".txt", ".yaml", ".hdf5", ".h5", ".ckpt", ".obj", ".ply", ".glb", ".gltf", ".wav", ".flac"]
@@ -20,7 +21,8 @@ RECORDS = frozenset(["manifest.json", "prepare.json", "metrics.csv"])
 
 
 def destination(path: Path) -> Path:
-    """The file or folder that a name leads to, through links; it need not exist."""
+    """The file or folder that a name leads to, through links and from the user's home; it need not exist."""
+    path = from_home(path)
     with suppress(FileNotFoundError, NotADirectoryError):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):

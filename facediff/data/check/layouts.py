@@ -17,6 +17,7 @@ from facediff.data.manifest import load_manifest
 from facediff.data.storage import WEIGHTS_FOLDER, rig_path
 from facediff.errors import FaceDiffError, choices, damaged, lacking, number
 from facediff.utils.arrays import open_array, vertices_of
+from facediff.utils.paths import name_of_file
 
 if TYPE_CHECKING:
     from facediff.data import SpeechMotionDataModule
@@ -148,7 +149,7 @@ def list_folder(root: Path, motion_folders: tuple[str, ...]) -> CorpusFolder:
                 if ".partial-" in path.name:
                     folder.leftovers.append(f"{name}/{path.name}")
             elif path.suffix == suffix:
-                files.setdefault(path.stem, path)
+                files.setdefault(name_of_file(path), path)
     return folder
 
 

@@ -51,6 +51,7 @@ from facediff.speech.audio import open_sound, refuse_cut_short
 from facediff.utils.batch import begin_folder, do_all
 from facediff.utils.files import atomic, check_writable, locked
 from facediff.utils.limits import quoted
+from facediff.utils.paths import name_of_file
 from facediff.utils.plain_files import parse_json
 from facediff.utils.ranges import Range, checked
 
@@ -238,9 +239,9 @@ class PackingPlan:
         clips, arrays, left_out, size, sources = {}, {}, [], 0, hashlib.sha256()
         rows = dict.fromkeys(CODINGS, 0)
         exact_clips = scored_clips(root, view) if tolerance and exact == "test" else frozenset()
-        sounds = {path.stem: path for path in sorted((root / "wav").glob("*.wav"))}
+        sounds = {name_of_file(path): path for path in sorted((root / "wav").glob("*.wav"))}
         motions = {
-            path.stem: path
+            name_of_file(path): path
             for folder in (WEIGHTS_FOLDER, *reversed(MOTION_FOLDERS))
             for path in sorted((root / folder).glob("*.npy"))
             if not path.name.startswith(".")

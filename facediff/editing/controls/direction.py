@@ -23,6 +23,7 @@ from facediff.spaces.arkit import ARKIT
 from facediff.utils import ranges
 from facediff.utils.hints import Range, check_number, shown
 from facediff.utils.limits import FRAME_RATES, check_format, quoted
+from facediff.utils.paths import existing, from_home
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_columns, write_json, write_rows
 from facediff.utils.records import read_record
 
@@ -350,7 +351,7 @@ def read_direction(path: str | Path, frame_rate: float | None = None) -> Directi
     """
     if is_mood(path):
         return Direction(MOODS[str(path)], str(path))
-    path = Path(path)
+    path = Path(from_home(path))
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return Direction(tuple(_read_keys(_csv_rows(path), str(path), frame_rate)), str(path))
@@ -374,7 +375,7 @@ def direction_file(folder: Path, recording: Path) -> Path | None:
     """The file of a folder that has the keys for a recording: ``NAME.direction.json``, ``NAME.json`` or ``.csv``."""
     for name in (f"{recording.stem}.direction", recording.stem):
         for suffix in (".json", ".csv"):
-            if (path := folder / f"{name}{suffix}").is_file():
+            if (path := existing(folder / f"{name}{suffix}")).is_file():
                 return path
     return None
 

@@ -13,7 +13,7 @@ import numpy as np
 from facediff.errors import FaceDiffError, choices
 from facediff.evaluation.figures.material import Array, FigureData, Painter
 from facediff.evaluation.figures.page import Grid, Heading, Paper, check_output, save, style
-from facediff.speech.phonemes import LENGTH, STRESS, TimedPhoneme
+from facediff.speech.phonemes import STRESS, TimedPhoneme
 
 HIGHEST = 50.0  # Largest height of a picture in mm
 
@@ -43,7 +43,7 @@ def find_phoneme(selector: str, phonemes: Sequence[TimedPhoneme], clip: str) -> 
 def _without_marks(ipa: str) -> str:
     """Without stress, length and diacritics."""
     letters = unicodedata.normalize("NFD", ipa)
-    return "".join(letter for letter in letters if letter not in STRESS + LENGTH and not unicodedata.combining(letter))
+    return "".join(letter for letter in letters if letter not in STRESS + "ː" and not unicodedata.combining(letter))
 
 
 @dataclass(frozen=True)

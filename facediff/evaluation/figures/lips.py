@@ -28,7 +28,7 @@ from facediff.evaluation.figures.page import (
 from facediff.metrics import LipPairs
 from facediff.metrics.mouth import opening
 from facediff.reporting.drawing import GREY, SMALLEST_TEXT, line_style, plain
-from facediff.speech.phonemes import BILABIALS, TimedPhoneme
+from facediff.speech.phonemes import TimedPhoneme, closed_times
 from facediff.utils import SAMPLE_RATE, ranges
 
 if TYPE_CHECKING:
@@ -124,13 +124,10 @@ def draw_lips(
         rest = list(axes[1:])
         if sound.phonemes:
             # Grey where the lips close in speech: a good method's curve is low there.
-            label: str | None = ", ".join(f"/{phone}/" for phone in BILABIALS)
-            for phoneme in sound.phonemes:
-                if phoneme.plain in BILABIALS:
-                    axes[0].axvspan(
-                        phoneme.start, phoneme.end, color=FAINT, alpha=0.45, linewidth=0, label=label, zorder=0
-                    )
-                    label = None
+            label: str | None = "/p/, /b/, /m/"
+            for start, end in closed_times(sound.phonemes):
+                axes[0].axvspan(start, end, color=FAINT, alpha=0.45, linewidth=0, label=label, zorder=0)
+                label = None
             _draw_phonemes(rest.pop(0), sound.phonemes, (low, high), paper)
         if sound.samples.size:
             _draw_waveform(rest[0], sound, (low, high), paper)

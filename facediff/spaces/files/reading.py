@@ -17,6 +17,7 @@ from facediff.spaces.files.csv_files import (
     write_live_link,
 )
 from facediff.utils.hdf5 import HDF5_SUFFIXES
+from facediff.utils.paths import from_home
 from facediff.utils.plain_files import read_columns
 
 ARRAYS = (".npy", ".npz", ".pt", *HDF5_SUFFIXES)
@@ -34,7 +35,7 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
             columns.
         frame_rate: frames a second of an array, where its layout states none.
     """
-    path = Path(path)
+    path = Path(from_home(path))
     suffix = _suffix(path, SUFFIXES)
     if suffix in ARRAYS:
         return read_array(path, layout, frame_rate)
