@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import inspect
 import math
+import os
 import re
 import typing
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar, Literal, NoReturn, Self, TypedDict, Unpack, get_args
 
 import torch
@@ -341,7 +342,6 @@ class ExactMetric(Metric):
 
     Args:
         definition: the metric in plain words, with its options.
-        settings: further options that distinguish the metric from others but need not be described.
         sync_on_compute: whether :meth:`compute` reduces the states over processes.
         process_group: over which processes; all if None.
         **kwargs: for :class:`torchmetrics.Metric`.
@@ -355,22 +355,32 @@ class ExactMetric(Metric):
 
     full_state_update = False
     is_differentiable = False
+    _given: tuple[tuple[Any, ...], dict[str, Any]] = ((), {})
+
+    def __new__(cls, *arguments: Any, **options: Any) -> Self:  # noqa: ANN401
+        """Keep the arguments, by which a collection tells metrics apart."""
+        metric = super().__new__(cls)
+        metric.__dict__["_given"] = arguments, options
+        return metric
 
     def __init__(
         self,
         *,
         definition: str,
-        settings: str = "",
         sync_on_compute: bool = True,
         process_group: Any = None,  # noqa: ANN401 - as torchmetrics has it
         **kwargs: object,
     ) -> None:
         super().__init__(sync_on_compute=sync_on_compute, process_group=process_group, **kwargs)
         self.definition = definition
-        # A MetricCollection merges metrics with states of the same names and were nearly equal after the
-        # first batch; a signed and an absolute deviation would be merged. A state with a name of its own prevents
-        # this.
-        described = f"{type(self).__name__}: {definition}; {settings}"
+        # A MetricCollection merges metrics of which all states have the same names and nearly the same values after the
+        # first batch: a signed and an absolute deviation, metres and millimetres of a perfect one. The name of a state
+        # tells metrics apart that differ in an argument.
+        positional, named = self._given
+        bound = inspect.Signature.bind(inspect.signature(type(self).__init__), self, *positional, **named)
+        bound.apply_defaults()
+        arguments = {name: _identity(value) for name, value in bound.arguments.items() if value is not self}
+        described = f"{type(self).__module__}.{type(self).__qualname__}: {definition}; {arguments}"
         mark = hashlib.sha256(described.encode()).hexdigest()[:16]
         self.add_state(f"definition_{mark}", torch.zeros(1, dtype=torch.int64), dist_reduce_fx="sum")
 
@@ -398,6 +408,21 @@ class ExactMetric(Metric):
 
         super()._apply(move_only, exclude_state)
         return self
+
+
+def _identity(value: object) -> object:
+    """What tells a constructor's argument apart: its content as far as it is plain data, or the object itself."""
+    if isinstance(value, Tensor):
+        content = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
+        return "tensor", value.dtype, tuple(value.shape), hashlib.sha256(content).hexdigest()
+    if isinstance(value, Mapping):
+        return {str(name): _identity(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value), [_identity(entry) for entry in value]
+    if is_dataclass(value):
+        return type(value), [_identity(getattr(value, entry.name)) for entry in fields(value)]
+    is_plain = value is None or isinstance(value, str | bytes | int | float | complex | type | os.PathLike)
+    return repr(value) if is_plain else (type(value), id(value))
 
 
 @dataclass(frozen=True)
@@ -479,7 +504,7 @@ class SequenceMetric(ExactMetric):
         checked_region = None if region is None else as_region(region, "vertices")
         definition = (definition or self.words).replace("{pooling}", POOLING_WORDS[pooling])
         definition = definition.replace("{region}", "all vertices" if checked_region is None else str(checked_region))
-        super().__init__(definition=definition, settings=length_rule, **kwargs)
+        super().__init__(definition=definition, **kwargs)
         self.pooling: Pooling = pooling
         self.length_rule: LengthRule = length_rule
         self.check_finite = check_finite
