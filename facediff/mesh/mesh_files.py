@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
+from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -54,7 +55,7 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
         raise FaceDiffError(f"{path}: not a mesh format that is read; expected one of {', '.join(SUFFIXES)}{advice}")
     data = read_bytes(path, remedy="expected a mesh")
     with damaged(path, f"not a readable {suffix[1:].upper()} mesh, export it again"):
-        mesh = READERS[suffix](data, path)
+        mesh = READERS[suffix](data.removeprefix(BOM_UTF8), path)  # some editors write a mark before a text
     if not len(mesh.vertices) or not (len(mesh.faces) or points_allowed):
         lacking = "triangles" if len(mesh.vertices) else "vertices"
         raise FaceDiffError(f"{path}: holds no {lacking}; expected a mesh with vertices and faces")
@@ -66,6 +67,8 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
 
 
 def _read_obj(data: bytes, path: Path) -> Mesh:
+    if re.search(rb"\\\r?\n|^[ \t]", data, re.MULTILINE):  # lines that go on, and indented ones
+        data = re.sub(rb"^[ \t]+", b"", re.sub(rb"\\\r?\n", b" ", data), flags=re.MULTILINE)
     lines = data.splitlines()
     rows = [line[2:].split() for line in lines if line[:2] in (b"v ", b"v\t")]
     if not rows:
@@ -155,7 +158,7 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
     end = re.search(rb"^end_header[ \t]*\r?\n", data[:HEADER], re.MULTILINE)
     if not data.startswith(b"ply") or end is None:
         raise ValueError("its header is not that of a PLY file, or does not end")
-    elements, form = _ply_header(data[: end.start()].decode("utf-8").splitlines(), path)
+    elements, form = _ply_header(data[: end.start()].decode("latin-1").split("\n"), path)
     body = memoryview(data)[end.end() :]
     columns = _ply_text(elements, bytes(body).split()) if form == "ascii" else _ply_binary(elements, body)
     vertex = columns["vertex"]

@@ -111,8 +111,8 @@ def _read_obj(path: Path) -> Textures | None:
     corners: list[tuple[int, int, int]] = []
     libraries: list[str] = []
     names, of_face, current = {"": 0}, [], 0
-    for line in path.read_bytes().decode("utf-8", errors="replace").splitlines():
-        word, _, rest = line.replace("\t", " ").partition(" ")
+    for line in path.read_bytes().decode("utf-8-sig", errors="replace").splitlines():
+        word, _, rest = line.strip().replace("\t", " ").partition(" ")
         if word == "vt":
             u, v = rest.split()[:2]
             uvs.append((float(u), float(v)))
@@ -153,7 +153,7 @@ def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str,
             losses.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
             continue
         name, left_out = "", set()
-        for line in file.read_bytes().decode("utf-8", errors="replace").splitlines():
+        for line in file.read_bytes().decode("utf-8-sig", errors="replace").splitlines():
             word, _, rest = line.strip().replace("\t", " ").partition(" ")
             if word == "newmtl":
                 name = rest.strip()

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -155,6 +156,9 @@ def face_content(checkpoint: dict[str, Any], face: str, path: object) -> dict[st
     return content
 
 
+WRAPPER = re.compile(r"(?:^|(?<=\.))(?:_orig_mod|_forward_module|_fsdp_wrapped_module|_checkpoint_wrapped_module)\.")
+
+
 def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
     """Refuse a content that has not the outer form of a checkpoint of facediff's, and drop options of 1.x in place."""
     parts = {"hyper_parameters", "state_dict", ASSETS_KEY}
@@ -167,6 +171,8 @@ def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - what
             else f"{path}: a checkpoint, but not of facediff: it lacks the templates and sizes that animation needs; "
             f"{EXPECTED}"
         )
+    # torch.compile and sharded strategies wrap modules, which adds a word to the names of their weights.
+    checkpoint["state_dict"] = {WRAPPER.sub("", key): value for key, value in checkpoint["state_dict"].items()}
     checkpoint["hyper_parameters"] = without_removed_options(checkpoint["hyper_parameters"], path)
 
 

@@ -231,3 +231,34 @@ def test_nodes_place_the_meshes_of_a_glb(node: dict[str, Any], expected: list[fl
 def test_a_mirrored_mesh_keeps_its_outside(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(changed("nodes", [{"mesh": 0, "scale": [-1, 1, 1]}]))
     assert read_mesh(tmp_path / "a.glb").faces.tolist() == [[2, 1, 0], [3, 2, 0]]
+
+
+SQUARE_OBJ = "# caf\u00e9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n"
+SQUARE_PLY = (
+    "ply\nformat ascii 1.0\ncomment caf\u00e9\nobj_info \u00fcber\nelement vertex 4\n"
+    "property float x\nproperty float y\n"
+    "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
+)
+SQUARE_OFF = "OFF\n# caf\u00e9\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
+WRITTEN = {
+    "PLY in Latin-1": (".ply", SQUARE_PLY.encode("latin-1")),
+    "PLY with a line end of Unicode in a comment": (".ply", SQUARE_PLY.replace("caf", "\x85 caf").encode("latin-1")),
+    "PLY of Windows": (".ply", SQUARE_PLY.replace("\n", "\r\n").encode("latin-1")),
+    "PLY with a mark": (".ply", SQUARE_PLY.encode("utf-8-sig")),
+    "OBJ with a mark": (".obj", SQUARE_OBJ.removeprefix("# caf\u00e9\n").encode("utf-8-sig")),
+    "OBJ in Latin-1": (".obj", SQUARE_OBJ.encode("latin-1")),
+    "OBJ, indented": (".obj", SQUARE_OBJ.replace("\nv", "\n  v").replace("\nf", "\n\tf").encode()),
+    "OBJ with lines that go on": (".obj", SQUARE_OBJ.replace("f 1 2 3", "f 1 2 \\\n 3").encode()),
+    "OFF with a mark": (".off", SQUARE_OFF.encode("utf-8-sig")),
+    "OFF in Latin-1": (".off", SQUARE_OFF.encode("latin-1")),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_mesh_of_other_editors_is_read(name: str, tmp_path: Path) -> None:
+    suffix, content = WRITTEN[name]
+    (tmp_path / f"square{suffix}").write_bytes(content)
+    mesh = read_mesh(tmp_path / f"square{suffix}")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]

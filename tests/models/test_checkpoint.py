@@ -248,3 +248,24 @@ def test_a_device_that_cannot_compute_is_refused(
     words = [speech, "--checkpoint", str(path), f"--device={device}", "-o", str(tmp_path / "out.npz")]
     assert main(["animate", *words]) == 2
     assert "--device" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda key: f"_orig_mod.{key}",
+        lambda key: key.replace("decoder.", "decoder._orig_mod."),
+        lambda key: f"_forward_module._fsdp_wrapped_module.{key}",
+        lambda key: (
+            ".".join(f"{word}._checkpoint_wrapped_module" for word in key.split(".")[:-1]) + "." + key.split(".")[-1]
+        ),
+    ],
+)
+def test_weights_of_wrapped_modules_are_the_models(
+    wrapped: Callable[[str], str], content: Tree, tmp_path: Path
+) -> None:
+    weights = {wrapped(key).removeprefix("."): value for key, value in content["state_dict"].items()}
+    assert weights.keys() != content["state_dict"].keys()
+    torch.save({**content, "state_dict": weights}, tmp_path / "a.ckpt")
+    assert read_checkpoint(tmp_path / "a.ckpt")["state_dict"].keys() == content["state_dict"].keys()
+    build_model(tmp_path / "a.ckpt", read_checkpoint(tmp_path / "a.ckpt"))
