@@ -377,9 +377,11 @@ class ExactMetric(Metric):
         # first batch: a signed and an absolute deviation, metres and millimetres of a perfect one. The name of a state
         # tells metrics apart that differ in an argument.
         positional, named = self._given
-        bound = inspect.Signature.bind(inspect.signature(type(self).__init__), self, *positional, **named)
-        bound.apply_defaults()
-        arguments = {name: _identity(value) for name, value in bound.arguments.items() if value is not self}
+        parameters = list(inspect.signature(type(self).__init__).parameters.values())[1:]
+        names = [parameter.name for parameter in parameters]
+        given = dict(zip(names, positional, strict=False)) | named
+        defaults = {each.name: each.default for each in parameters if each.default is not inspect.Parameter.empty}
+        arguments = {name: _identity(value) for name, value in sorted({**defaults, **given}.items())}
         described = f"{type(self).__module__}.{type(self).__qualname__}: {definition}; {arguments}"
         mark = hashlib.sha256(described.encode()).hexdigest()[:16]
         self.add_state(f"definition_{mark}", torch.zeros(1, dtype=torch.int64), dist_reduce_fx="sum")
