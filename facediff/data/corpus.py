@@ -353,7 +353,7 @@ class Corpus:
         for number, row in enumerate(read_table(path, remedy=remedy), 1):
             pair = " ".join(row).split()
             if len(pair) != 2 or not all(word.isdecimal() and int(word) < self.n_vertices for word in pair):
-                raise FaceDiffError(f"{path}: row {number} is {','.join(row)!r}; {remedy}, below {self.n_vertices}")
+                raise FaceDiffError(f"{path}: row {number} is {', '.join(row)!r}; {remedy}, below {self.n_vertices}")
             rows.append((int(pair[0]), int(pair[1])))
         return torch.tensor(rows, dtype=torch.long).view(-1, 2)
 

@@ -131,10 +131,11 @@ def statistics(seed: int = 5) -> dict[str, np.ndarray]:
     return means | {f"{key}_std": draw(size, spread=0.1, shift=1.0).abs().numpy() for key, size in sizes.items()}
 
 
-def write_diffposetalk(folder: Path, *, head: bool) -> list[Path]:
-    """The two files, with the options of a released one."""
+def write_diffposetalk(folder: Path, *, head: bool, **changes: Any) -> list[Path]:  # noqa: ANN401
+    """The two files, with the options of a released one and changes of them."""
     model, style = diffposetalk_states(head)
     common = {"rot_repr": "aa", "n_motions": WINDOW, "fps": 25, "data_root": PosixPath("datasets/HDTF_TFHP/lmdb")}
+    common |= changes
     options: dict[str, Any] = {
         **common,
         **{"target": "sample", "architecture": "decoder", "audio_model": "hubert", "n_heads": 2, "pad_mode": "zero"},

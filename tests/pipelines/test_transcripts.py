@@ -37,6 +37,7 @@ def test_times_of_a_transcript_are_those_of_the_corpus(puppet_corpus: Path) -> N
             align_transcript(text, said)
 
 
+@pytest.mark.filterwarnings("ignore:.* labels close the lips:facediff.errors.Note")
 def test_animation_closes_its_lips_by_alignment_and_by_transcript(
     model: facediff.Animator, puppet_corpus: Path
 ) -> None:

@@ -49,6 +49,8 @@ from facediff.spaces.layouts import layout
 from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import open_array, read_arrays
+from facediff.utils.hints import check_number
+from facediff.utils.limits import FRAME_RATES, quoted
 from facediff.utils.ranges import Range
 
 WEIGHTS = {"velocity": 5.0, "smoothness": 0.5, "head": 0.05, "head_velocity": 5.0, "style": 0.1}
@@ -530,6 +532,14 @@ STATISTICS = tuple(f"{key}_{name}" for key in ("exp", "pose", "shape") for name 
 def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
     """One speaker, or the speakers of the given shapes, and the statistics that standardise shapes and motion."""
     count = files.size("denoising_net.person_proj.weight", 1) - files.size("null_style_feat", 2)
+    stated: dict[str, Any] = {}
+    for arguments in files.arguments.values():
+        stated |= {name: arguments[name] for name in ("fps", "rot_repr") if arguments.get(name) is not None}
+    rate = check_number(files.source, "args.fps", stated.get("fps", 25), *FRAME_RATES)
+    if (rotations := stated.get("rot_repr", "aa")) != "aa":
+        raise OptionError.naming(
+            f"{files.source}: args.rot_repr is {quoted(rotations)}; expected aa, rotations as vectors along their axes"
+        )
     statistics, templates = options.statistics, options.templates
     if statistics is None:
         raise OptionError.naming(
@@ -560,7 +570,7 @@ def faces_of(files: AuthorFiles, options: ImportOptions) -> Facts:
     }
     return Facts(
         "HDTF_TFHP",
-        25.0,
+        rate,
         list(rows),
         dict.fromkeys(rows, torch.zeros(56, 1)),
         layout(files.card.layout),

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
+from facediff.errors import OptionError
 from facediff.models.checkpoint_content import PersonStyles
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import SpeechStream, Style
@@ -163,7 +164,12 @@ def statistics_of(content: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Te
         torch.cat([torch.as_tensor(content[f"{key}_{name}"]).float().flatten() for key in keys])
         for name in ("mean", "std")
     )
-    return mean, deviation.clamp_min(1e-9)
+    if not bool((deviation > 0).all()):
+        raise OptionError.naming(
+            f"{{statistics}}: the deviations of {', '.join(keys)} hold {float(deviation.min()):g}; expected numbers "
+            f"above 0, as the authors' file has them"
+        )
+    return mean, deviation
 
 
 class PieceStream(SpeechStream):

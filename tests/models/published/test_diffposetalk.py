@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from facediff.data import Reference
+from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel, import_checkpoint
 from facediff.models.graphs import update_table
 from facediff.models.inference import Style
@@ -205,6 +207,27 @@ def test_shapes_are_standardised_by_the_files_statistics(tmp_path: Path) -> None
     model = import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=figures, templates={"A": shape})
     expected = (shape.numpy() - figures["shape_mean"]) / figures["shape_std"]
     np.testing.assert_allclose(model.shapes[0], expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("key", ["exp_std", "pose_std", "shape_std"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_deviations_that_move_nothing_are_refused(key: str, value: float, tmp_path: Path) -> None:
+    figures = author.statistics()
+    figures[key][1] = value
+    with pytest.raises(FaceDiffError, match="deviations of .* hold"):
+        import_checkpoint(author.write_diffposetalk(tmp_path, head=True), audio_config=AUDIO_CONFIG, statistics=figures)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [({"fps": 30}, ""), *(({"fps": rate}, "fps") for rate in (0, np.nan, 1e9)), ({"rot_repr": "6d"}, "rot_repr")],
+)
+def test_rate_and_rotations_are_the_files(changes: dict[str, Any], problem: str, tmp_path: Path) -> None:
+    files = author.write_diffposetalk(tmp_path, head=True, **changes)
+    with pytest.raises(FaceDiffError, match=problem) if problem else nullcontext():
+        model = import_checkpoint(files, audio_config=AUDIO_CONFIG, statistics=author.statistics())
+        assert model.frame_rate == 30
+        assert len(model.animate(torch.zeros(16_000), identity="speaker").vertices) == 30
 
 
 def test_one_sample_is_silence() -> None:
