@@ -16,7 +16,7 @@ import facediff
 from facediff.cli.app import main
 from facediff.cli.configs import with_files
 from facediff.data.corpus import load_template_dict
-from facediff.evaluation.files import TRUTH_PATTERN, NamePattern, index_truths, list_names, pair_up
+from facediff.evaluation.file_pairs import TRUTH_PATTERN, NamePattern, index_truths, list_names, pair_up
 from facediff.utils.files import atomic, atomic_folder, check_writable
 from facediff.utils.paths import from_home
 from tests.fakes.tiny import Tiny
