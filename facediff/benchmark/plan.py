@@ -171,12 +171,7 @@ def find_plan(path: Path) -> Path:
 
 
 def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkPlan:
-    """Read a plan and check all that can be checked without running anything.
-
-    Args:
-        path: a YAML file.
-        roots: folders of corpora by the plan's names, which override the plan's.
-    """
+    """Read a plan and check all that can be checked without running anything."""
     plan = read_record(BenchmarkPlan, load_yaml(path, "expected a plan such as configs/benchmark/quick.yaml"), path)
     check_known("--root", "corpus", roots or {}, plan.corpora)
     return replace(

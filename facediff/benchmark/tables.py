@@ -126,17 +126,7 @@ def report_of(
     level: ranges.Level = 0.95,
     seed: ranges.Seed = 0,
 ) -> BenchmarkReport:
-    """Make the tables.
-
-    Args:
-        outline: of the plan.
-        results: of its cells.
-        pending: cells without a result.
-        baseline: the row that all others are compared with, instead of the plan's.
-        resamples: of the bootstrap over sentences.
-        level: of intervals, and 1 − the level of significance.
-        seed: of resamples and permutations.
-    """
+    """Make the tables."""
     bootstrap = Bootstrap(resamples, level, seed)
     scored = [result for result in results if not result.problem]
     failed = [result.problem for result in results if result.problem]

@@ -33,12 +33,7 @@ class Manifest:
 
 
 def load_manifest(path: Path, *, remedy: str = REMEDY) -> dict[str, Any]:
-    """The object in a manifest, or in the state of a preparation that is running.
-
-    Args:
-        path: the file.
-        remedy: what messages advise.
-    """
+    """The object in a manifest, or in the state of a preparation that is running."""
     manifest = load_json(path, remedy=remedy)
     if not isinstance(manifest, dict):
         raise FaceDiffError(f"{path}: holds no JSON object; {remedy}")

@@ -257,13 +257,7 @@ def within(picks: Sequence[int], frames: int) -> Sequence[int]:
 
 
 def refuse_out_of_range(vertices: npt.NDArray[np.float32], numbers: Sequence[int], source: object) -> None:
-    """Refuse absolute vertices (T, V, 3) that are not finite, or so large that their squares are infinite in float32.
-
-    Args:
-        vertices: the frames.
-        numbers: the frames' numbers in the clip, for the message.
-        source: the clip's file.
-    """
+    """Refuse vertices (T, V, 3) that are not finite, or so large that their squares are infinite in float32."""
     if not in_range(vertices):
         index = int(np.argmax(~(np.abs(vertices) <= COORDINATE).all((1, 2))))
         raise FaceDiffError(

@@ -60,11 +60,7 @@ class Performer(ABC):
 
     @abstractmethod
     def finish(self, frames: int) -> Acted:
-        """The values (m, 5) of the frames that are left.
-
-        Args:
-            frames: in all.
-        """
+        """The values (m, 5) of the frames that are left."""
 
 
 def read_acting(text: str) -> Acting:

@@ -319,11 +319,7 @@ class Landmarks:
                 )
 
     def refuse_contradictions(self, where: object) -> None:
-        """Refuse pairs of one place with several places of the other mesh; the same pair may be repeated.
-
-        Args:
-            where: the pairs' name in messages.
-        """
+        """Refuse pairs of one place with several places of the other mesh; the same pair may be repeated."""
         points = [list(map(str, np.hstack([side.corners, side.weights]).tolist())) for side in self._sides]
         for name, one, opposite in (("source", *points), ("target", *reversed(points))):
             partners: dict[str, int] = {}
@@ -517,14 +513,7 @@ def as_rows(landmarks: Landmarks) -> list[dict[str, Any]]:
 
 
 def write_landmarks(path: Path, landmarks: Landmarks, source_vertices: int, target_vertices: int) -> None:
-    """Write pairs of places as JSON, whole or not at all.
-
-    Args:
-        path: the .json file.
-        landmarks: the pairs.
-        source_vertices: of the source mesh.
-        target_vertices: of the target mesh.
-    """
+    """Write pairs of places as JSON, whole or not at all."""
     write_json(
         path,
         {

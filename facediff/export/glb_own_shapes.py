@@ -102,11 +102,7 @@ class OwnShapes:
 
 
 def own_shapes(target: Path) -> OwnShapes:
-    """The shapes and bones of an avatar by their names.
-
-    Args:
-        target: the .glb.
-    """
+    """The shapes and bones of an avatar by their names."""
     with damaged(target, REMEDY):
         return _own_shapes(open_glb(target))
 

@@ -116,12 +116,7 @@ def _blocks(flat: Array) -> Iterator[npt.NDArray[np.float64]]:
 
 
 def compress_long(parts: Parts, tolerance: float) -> tuple[Array, Array, int] | None:
-    """Weights (T, M), shapes (M, 3V) and the number of components of a motion; None if it needs too many.
-
-    Args:
-        parts: the motion, which is read several times.
-        tolerance: largest distance of a vertex.
-    """
+    """Weights (T, M), shapes (M, 3V) and the number of components of a motion; None if it needs too many."""
     for rank in RANKS:
         axes = leading_axes(parts(), rank)
         scores = np.concatenate([part @ axes.T for part in parts()])

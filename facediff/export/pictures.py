@@ -50,12 +50,6 @@ def draw_correspondence(path: Path, animation: Animation, carried: Animation, co
     """Draw both meshes with the widest mouth, a full blink and raised brows, and how far each target vertex moves.
 
     The last column shows how far the meshes lie apart at rest, and the eyes of the target from near.
-
-    Args:
-        path: the picture (.png).
-        animation: on the source mesh.
-        carried: the same on the target mesh.
-        correspondence: the correspondence between them.
     """
     frames = telling_frames(animation.still(), correspondence)
     opening = mouth_opening(animation)

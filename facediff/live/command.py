@@ -21,14 +21,7 @@ Report = Callable[[str], None]
 def perform(
     options: LiveOptions, open_model: Callable[[], LiveModel], report: Report, *, weights: bool = False
 ) -> LiveSummary:
-    """Perform from the first check to the report at the end.
-
-    Args:
-        options: the choices.
-        open_model: opens the model, after everything else has been checked.
-        report: prints a sentence.
-        weights: whether the model may give weights of ARKit's shapes by itself.
-    """
+    """Perform from the first check to the report at the end."""
     options.check()
     # What fails quickly comes first: a model takes seconds to open.
     receivers = open_receivers(options.to or [])

@@ -85,12 +85,7 @@ def hands_on_textures(path: Path, output: Path) -> bool:
 
 
 def read_textures(path: Path, n_triangles: int) -> Textures:
-    """Texture coordinates and materials of an .obj or .glb.
-
-    Args:
-        path: the file.
-        n_triangles: of the mesh that it is of.
-    """
+    """Texture coordinates and materials of an .obj or .glb."""
     reader = {".glb": _read_glb, ".obj": _read_obj}.get(path.suffix.lower()) if path.is_file() else None
     with damaged(path, f"not a readable {path.suffix[1:].upper()} mesh, export it again"):
         surface = None if reader is None else reader(path)

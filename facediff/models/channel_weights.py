@@ -35,13 +35,6 @@ def channel_weights(
 
     It keeps the size of the motion: W x has as much variance over the training motion as x. Head and eyes, which turn
     as a whole and which the rig of a face does not know, count as much as its mean channel does.
-
-    Args:
-        assets: of the corpus.
-        variances: of each channel over the training motion.
-        covariance: of the channels.
-        points: weights of the rig's vertices, or without a rig of the channels.
-        by: see :data:`ChannelWeights`.
     """
     count, space = len(variances), assets.space
     weights = torch.eye(count, dtype=torch.float64)

@@ -39,12 +39,7 @@ class InventedSpeakers(nn.Module):
         self.components = PrincipalComponents(n_vertices, dims, COMPONENTS)
 
     def forward(self, batch: Batch, scale: float) -> Batch:
-        """The batch with some of its clips changed; nothing is changed in place.
-
-        Args:
-            batch: of training, with offsets in the corpus's unit.
-            scale: from these to the offsets that the principal components were taken of.
-        """
+        """The batch with some of its clips changed; nothing is changed in place."""
         device = batch.motion.device
         drawn_clips = torch.rand(len(batch), device=device) < self.share
         if not drawn_clips.any():

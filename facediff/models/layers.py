@@ -41,13 +41,7 @@ Rotation = tuple[Tensor, Tensor]
 
 
 def check_heads(*, even: bool = False, rotary: bool = False, **options: int) -> None:
-    """Refuse a width that its attention heads do not divide.
-
-    Args:
-        even: whether sines and cosines take half of the width each.
-        rotary: whether they take half of every head's channels each.
-        options: the width and the number of heads, by the names of their options.
-    """
+    """Refuse a width that its attention heads do not divide."""
     (name, width), (heads, count) = options.items()
     if width % (2 * count if rotary else count) or (even and width % 2):
         raise ArgumentError(options, f"{name} must be a multiple of {'2 ' * rotary}{heads}{', and even' * even}")

@@ -169,12 +169,7 @@ LAYOUTS: dict[str, Layout] = {
 
 
 def find_layout(name: str, where: str = "layout") -> Layout:
-    """A layout by its name.
-
-    Args:
-        name: the layout's name.
-        where: name of the option or file, for messages.
-    """
+    """A layout by its name."""
     check_known(where, "layout", [name], LAYOUTS)
     return LAYOUTS[name]
 

@@ -137,10 +137,6 @@ def make_schedules(forms: Sequence[Sequence[Showing]], seed: int) -> tuple[list[
     """The trials of all forms, and the schedules, as numbers of trials.
 
     Raters 0, 1, 2 … get schedules 0, 1, 2 …, so that forms alternate from rater to rater.
-
-    Args:
-        forms: from :func:`make_forms`.
-        seed: of which trial is which number in the square, and in which order its rows come.
     """
     rng = np.random.default_rng([seed, 1])
     trials = sorted({showing for form in forms for showing in form})

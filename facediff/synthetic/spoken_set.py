@@ -114,13 +114,7 @@ class SpokenClip:
 
 
 def spoken_set(languages: Sequence[str], voices: int, sentences: int) -> list[SpokenClip]:
-    """Sentences in several voices of several languages; each voice of a language has sentences of its own, in turn.
-
-    Args:
-        languages: codes in :data:`LANGUAGES`.
-        voices: of each language, as far as they are installed.
-        sentences: of each voice.
-    """
+    """Sentences in several voices of several languages; each voice of a language has sentences of its own, in turn."""
     installed = installed_voices()
     clips = []
     for code in languages:

@@ -90,11 +90,6 @@ def run_batch(
 def do_all(work: Callable[[Task], Result], tasks: Sequence[Task], **options: Any) -> list[Result]:  # noqa: ANN401
     """Do tasks that must all succeed: of those that fail, the first in their order is reported at the end.
 
-    Args:
-        work: does a task.
-        tasks: hashable and different.
-        options: as :func:`run_batch` takes them.
-
     Returns:
         results in the order of the tasks.
     """

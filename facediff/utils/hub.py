@@ -82,13 +82,7 @@ def bundled_by_name(source: Source) -> Source | Path:
 
 
 def check_model_source(source: str | os.PathLike[str], option: str = "", expected: str = EXPECTED) -> None:
-    """Refuse, before anything heavy is imported, what can be no trained model.
-
-    Args:
-        source: name or path that the user gave.
-        option: the option that names it, for messages.
-        expected: the expectation in messages.
-    """
+    """Refuse, before anything heavy is imported, what can be no trained model."""
     label = f"{option} {source}".strip()
     source, _ = split_face(source)
     fault = ""

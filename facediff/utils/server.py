@@ -155,13 +155,7 @@ def own_page_only(hosts: Collection[str] | None, public_name: str | None = None)
 
 
 def require_server(purpose: str, names: Collection[str] = ("starlette", "uvicorn"), extra: str = "study") -> None:
-    """Refuse to begin where the server's packages are not installed.
-
-    Args:
-        purpose: of the packages, in words.
-        names: of the packages.
-        extra: of facediff that brings them.
-    """
+    """Refuse to begin where the server's packages are not installed."""
     for name in names:
         with needs_extra(name, extra, purpose):
             importlib.import_module(name)

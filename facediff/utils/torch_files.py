@@ -25,12 +25,7 @@ AUTHORS = "expected a checkpoint as its authors distribute it (.pth, .pth.tar, .
 
 
 def load_tensors(file: str | os.PathLike[str] | IO[bytes], expected: str = EXPECTED) -> Any:  # noqa: ANN401
-    """The tensors and plain data of a file that ``torch.save`` wrote, on the CPU.
-
-    Args:
-        file: the file, which may be open.
-        expected: how messages end.
-    """
+    """The tensors and plain data of a file that ``torch.save`` wrote, on the CPU."""
     import torch
 
     try:

@@ -12,12 +12,7 @@ from facediff.utils.limits import quoted
 
 
 def load_yaml(path: Path, remedy: str) -> dict[str, Any]:
-    """The mapping that a YAML file holds; its values are plain data, and dates stay text.
-
-    Args:
-        path: the file.
-        remedy: how messages end.
-    """
+    """The mapping that a YAML file holds; its values are plain data, and dates stay text."""
     text = yaml_text(path, remedy)
     check_yaml(text, path)
     with damaged(f"{path}: is not readable as YAML", remedy, yaml.YAMLError):  # a list as a key, say

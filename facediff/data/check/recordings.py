@@ -50,14 +50,7 @@ def _folder(module: type[ParametricDataModule], root: Path, layout: str | None) 
 
 
 def check_recordings(report: CheckReport, root: Path, module: type[ParametricDataModule], corpus: str | None) -> None:
-    """Add the contents and the defects of a folder of recordings to a report.
-
-    Args:
-        report: the report.
-        root: the folder.
-        module: its data module.
-        corpus: its name as the user gave it, with the layout of arrays.
-    """
+    """Add the contents and the defects of a folder of recordings to a report."""
     from facediff.speech.audio import SAMPLE_RATE, read_speech
 
     layout = (corpus or "").partition(":")[2] or None

@@ -526,14 +526,7 @@ def encode_speech(path: Path) -> bytes:
 
 
 def write_blob(out: Path, name: str, size: int, contents: Iterable[bytes]) -> ArrayInfo:
-    """Write an array of bytes; no more than a shard is in memory.
-
-    Args:
-        out: the packed corpus.
-        name: the array's name.
-        size: of all parts together.
-        contents: its parts, in order.
-    """
+    """Write an array of bytes; no more than a shard is in memory."""
     chunks = max(1, min(BLOB_SHARD, size + BLOB_CHUNK - 1) // BLOB_CHUNK)
     array = ArrayInfo("uint8", size, 0, BLOB_CHUNK, chunks, ())
     shard_bytes, buffer, shard = BLOB_CHUNK * chunks, bytearray(), 0

@@ -197,10 +197,6 @@ def cache_folder(identity: str, size: int) -> Path | None:
     """The folder for the ranges of a packed corpus at an address; None for one that is larger than the limit.
 
     The corpora that were not opened for the longest time are removed until this one fits.
-
-    Args:
-        identity: of the corpus.
-        size: of all its shards in bytes.
     """
     limit, folder = limit_bytes(VARIABLE, USUAL_GB), cache_dir() / "packed" / identity / "chunks"
     if size > limit:

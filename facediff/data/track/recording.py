@@ -150,13 +150,7 @@ class RecordingSummary:
 
 
 def summarise(recording: Recording, model: FaceModel, sample_size: int) -> RecordingSummary:
-    """Find the usable parts of a recording; a video that cannot be used is refused.
-
-    Args:
-        recording: the video.
-        model: the canonical face.
-        sample_size: frames of the sample.
-    """
+    """Find the usable parts of a recording; a video that cannot be used is refused."""
     count, source = len(recording.times), recording.source
     if count < 2 or recording.missed > MOST_MISSED * count:
         raise FaceDiffError(

@@ -219,10 +219,6 @@ class ControlledFace:
         """An animation, or a stretch of one, with everything changed that is asked for.
 
         The order is expressiveness, shapes, brows, gaze, lids, and last the head, which takes everything along.
-
-        Args:
-            animation: of the face, with frames as the model made them.
-            amounts: of these frames.
         """
         if procedural.moves_head(animation):
             raise FaceDiffError(
@@ -275,13 +271,7 @@ class ControlledFace:
 
 
 def apply_controls(animation: Animation, controls: AnimationControls, *, seed: int = 0) -> Animation:
-    """A finished animation with controls applied, acting among them; the same object if there are none.
-
-    Args:
-        animation: with frames as the model made them.
-        controls: the options.
-        seed: of blinks, gaze, sway and acting, unless the controls have their own.
-    """
+    """A finished animation with controls applied, acting among them; the same object if there are none."""
     if controls.is_off:
         return animation
     refuse_folder(controls.direction)

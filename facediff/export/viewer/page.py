@@ -104,12 +104,7 @@ def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 3
 
 
 def page_parts(animations: Sequence[Animation], *, truth: int | None = None) -> Iterator[str]:
-    """The text of the page in pieces, in order, as :func:`write_page` writes it.
-
-    Args:
-        animations: as :func:`write_page` takes them.
-        truth: as :func:`write_page` takes it.
-    """
+    """The text of the page in pieces, in order, as :func:`write_page` writes it."""
     check_page(animations)
     blobs = Blobs()
     return _page_parts(_page_facts(animations, truth, blobs), blobs)

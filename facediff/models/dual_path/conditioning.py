@@ -181,13 +181,7 @@ class ConditionEncoding(nn.Module):
         audio: Float[Tensor, "batch frames dim"],
         mask: Bool[Tensor, "batch frames"],
     ) -> Float[Tensor, "batch dynamic_dim"]:
-        """F_dyn of style vectors, with the change that the speech asks for where they want it.
-
-        Args:
-            style: style vectors.
-            audio: features of the speech that is animated.
-            mask: True on valid frames.
-        """
+        """F_dyn of style vectors, with the change that the speech asks for where they want it."""
         if self.speech_style is None:
             return style
         dynamic, share = style[:, :-1], style[:, -1:]

@@ -121,14 +121,7 @@ class ComponentObjective(TrainingObjective):
 
 
 def objective_of(model: DualPathRecipe, batch: Batch, step: Int[Tensor, " draws"], draws: int) -> TrainingObjective:
-    """The objective of a model's motion space.
-
-    Args:
-        model: trained by it.
-        batch: clips with their true motion.
-        step: of every draw, clip by clip.
-        draws: noisy versions of every clip.
-    """
+    """The objective of a model's motion space."""
     space, motion, mask = model.motion_space, batch.motion, batch.mask
     if space.preconditioning is not None:
         motion = space.encode(model.scaled(motion))

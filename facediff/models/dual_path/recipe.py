@@ -44,10 +44,6 @@ def log_snr_weights(process: NoiseProcess, hidden: Float[Tensor, " steps"]) -> F
     Where neighbouring frames tell a noisy one, speech is needed in the noisiest few per cent of the steps alone,
     and there a sampler takes half of its steps. Of the draws, 85 % are uniform in ln SNR, from where noise leaves
     a two-hundredth of the motion open to where it leaves 70 %; the others are uniform over all steps.
-
-    Args:
-        process: the noise process.
-        hidden: the share of the motion that noise leaves open in each step, rising.
     """
     signal = process.signal.cpu().double()
     level = (signal / (1 - signal)).log()
@@ -122,11 +118,6 @@ def spread_for(first_noise: float, last_noise: float, share: float) -> float:
     noise) / first noise, within 8 % of a sweep with two to eight steps of the bundled model (docs/generation.md). The
     factor is the root of it, since it counts twice.
 
-    Args:
-        first_noise: from which steps are spread evenly in ln SNR.
-        last_noise: at which the usual number of steps ends.
-        share: of the steps that go to the last noise.
-
     >>> [round(spread_for(2000.0, 10.0, steps / 10), 2) for steps in (2, 3, 5, 10, 20)]
     [1.31, 1.18, 1.07, 1.0, 1.0]
     """
@@ -200,10 +191,6 @@ class DualPathRecipe(ConditionedModel):
 
         Unit variance of a coordinate says little: 60 weights are smaller as a whole than the coordinates of 6 000
         vertices by a factor of 20, and the same noise would hide another share of them.
-
-        Args:
-            reference_model: a measured model.
-            data: this model's corpus, on which it has been measured too.
         """
         space, reference = self.motion_space, reference_model.motion_space
         scale = self.assets.motion_scale

@@ -100,12 +100,7 @@ class SpeechStyle(nn.Module):
     def forward(
         self, features: Float[Tensor, "batch frames dim"], mask: Bool[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch style_dim"]:
-        """The change of the style that speech asks for, at most :data:`REACH` times a usual one.
-
-        Args:
-            features: of the speech.
-            mask: True on valid frames.
-        """
+        """The change of the style that speech asks for, at most :data:`REACH` times a usual one."""
         mean, deviation, weight, reach = self._fitted.get([self.squares, self.products], "map", self._fit)
         with torch.autocast(features.device.type, enabled=False):
             standard = (self._numbers(features, mask)[:, :-1] - mean) / deviation

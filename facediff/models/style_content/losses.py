@@ -114,12 +114,7 @@ def relative_distance(
 
 
 def style_distance(styles: Float[Tensor, "clips dim"], identities: Sequence[str]) -> Float[Tensor, ""]:
-    """Mean squared difference of two styles of one identity, over all such pairs; 0 if no identity has two styles.
-
-    Args:
-        styles: style vectors.
-        identities: of the speakers.
-    """
+    """Mean squared difference of two styles of one identity, over all such pairs; 0 if no identity has two styles."""
     count = len(identities)
     pairs = [(i, k) for i in range(count) for k in range(i + 1, count) if identities[i] == identities[k]]
     if not pairs:

@@ -26,9 +26,6 @@ def read_beat(path: Path) -> ParameterClip:
 
     BEAT's first frame has the time 1/60, which is kept as the clip's start. Without times, the metadata states the
     rate.
-
-    Args:
-        path: the file.
     """
     content = load_json(path, remedy=REMEDY)
     with damaged(path, REMEDY):

@@ -152,9 +152,6 @@ def read_live_link(path: Path) -> ParameterClip:
     as absent. Rotations are radians about the axes of a right-handed face that looks along +z: yaw to its left, pitch
     down. The rate comes from the timecode; where its steps are longer, rows were dropped,
     which :func:`~facediff.spaces.files.clips.even` interpolates.
-
-    Args:
-        path: the table.
     """
     space = layout("live_link")
     header, rows = read_columns(path, (TIMECODE, COUNT, *space.channels), remedy=REMEDY)
@@ -234,11 +231,7 @@ PREFIX = "blendShapes."
 
 
 def read_audio2face(path: Path) -> ParameterClip:
-    """Read the weights that Audio2Face's service writes: ``timeCode`` in seconds and ``blendShapes.<name>``.
-
-    Args:
-        path: the table.
-    """
+    """Read the weights that Audio2Face's service writes: ``timeCode`` in seconds and ``blendShapes.<name>``."""
     space = layout("audio2face")
     header, rows = read_columns(path, ("timeCode", *(PREFIX + name for name in space.channels)), remedy=REMEDY)
     shapes = [name.removeprefix(PREFIX) for name in header if name.startswith(PREFIX)]
