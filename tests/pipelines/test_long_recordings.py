@@ -39,6 +39,7 @@ def test_memory_grows_by_the_speech_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.skipif(sys.platform != "linux", reason="pages of files are given back on Linux")
 @pytest.mark.parametrize(("suffix", "options"), [(".npz", ()), (".glb", ()), (".html", ()), (".mp4", ("--size", "64"))])
 def test_an_hour_takes_less_than_600_mb(tmp_path: Path, suffix: str, options: tuple[str, ...]) -> None:
