@@ -21,7 +21,7 @@ from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
-from facediff.utils.files import LockedError, atomic, locked, sweep
+from facediff.utils.files import LockedError, atomic, locked, remove_lock, sweep
 from facediff.utils.hub import check_model_source, check_training_source, local_model
 
 STATE_KEY = "facediff_training_state"
@@ -210,8 +210,10 @@ def entered_run(
                     if numbered and entries:
                         continue  # new loggers look for a free number again
                     raise
-                for earlier in run_folder(trainer).parent.glob("*/checkpoints"):
-                    sweep(earlier)  # leftovers of a run that was killed in its first save
+                for earlier in run_folder(trainer).parent.glob("*/"):  # leftovers of runs that were killed
+                    sweep(earlier)
+                    sweep(earlier / "checkpoints")
+                    remove_lock(earlier / LOCK)
             yield
             return
 

@@ -179,9 +179,10 @@ def animate_recording(
     confirm_cost(yes, "--samples, --steps or --size", seconds=seconds, size=size)
     written, animation = pipeline.write(recording, output, files)
     metadata = animation.metadata
-    notes = "".join(f", {name}: {metadata[name]}" for name in ("edited", "procedural") if name in metadata)
-    notes += f", licence: {metadata.get('licence', 'not stated')}"
-    line = f"{len(animation.vertices)} frames, identity {metadata['identity']}, style of {metadata['style']}{notes}"
+    facts = {"identity": "identity ", "style": "style of ", "edited": "edited: ", "procedural": "procedural: "}
+    notes = [f"{words}{metadata[name]}" for name, words in facts.items() if name in metadata]
+    notes += [f"licence: {metadata.get('licence', 'not stated')}"]
+    line = f"{len(animation.vertices)} frames, {', '.join(notes)}"
     for path in written:
         tell(f"{path}: {line}")
         line = "next to it"

@@ -9,6 +9,7 @@ import datetime  # noqa: F401 - before NumPy, which makes an ImportError of a Ct
 import errno
 import io
 import os
+import re
 import signal
 import sys
 import warnings
@@ -29,6 +30,14 @@ TRACEBACK = "FACEDIFF_TRACEBACK"
 """Environment variable that shows the traceback of an unexpected error in place of a sentence."""
 LONG, LARGE = 3600.0, 8 * 2**30
 """Seconds and bytes above which a command names its cost and waits for a yes."""
+
+
+LOST_PROCESS = re.compile(
+    r"(gloo|NCCL|ProcessGroup|TCPStore|store).*"
+    r"(onnection (closed|reset|refused)|roken pipe|imed? ?out|remote process exited|recvValue|sendBytes)",
+    re.IGNORECASE,
+)
+"""What PyTorch says where another process of a distributed run has gone."""
 
 
 class StandardOutputError(FaceDiffError):
@@ -188,6 +197,11 @@ def report(error: BaseException) -> int:
         return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
     if isinstance(error, UnicodeError):
         return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
+    if isinstance(error, RuntimeError) and LOST_PROCESS.search(text):
+        return fail(
+            f"another process of the run ended, or cannot be reached; see its own message, and continue a training "
+            f"with --ckpt_path last ({more})"
+        )
     refusal = next((cause for cause in chain(error) if _refuses(cause)), None)
     if refusal is not None:
         return fail(f"{' '.join(str(refusal).split())} ({more})")

@@ -717,7 +717,9 @@ def further_corpus(name: str, options: dict[str, Any]) -> SpeechMotionDataModule
     module = find_class(corpora, path, SpeechMotionDataModule)
     arguments = {key: value for key, value in options.items() if key != "corpus"}
     unknown = arguments.keys() - (options_of(module) if module is not None else {})
-    if not is_name(name) or module is None or "further_corpora" in options or unknown:
+    if not is_name(name) or "." in name or hasattr(torch.nn.ModuleDict(), name):
+        raise ArgumentError({"further_corpora": name}, "is no name that a part of a model can have; choose another")
+    if module is None or "further_corpora" in options or unknown:
         raise ArgumentError(
             {f"further_corpora.{name}": options},
             f"expected options of a data module with corpus=NAME, one of {', '.join(corpora.names())}",

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from facediff.errors import FaceDiffError, choices, damaged
 from facediff.registry import puppet_voice
+from facediff.speech.audio import read_speech
 from facediff.speech.espeak import EspeakVoice, SpokenPhoneme, Utterance, speak
 from facediff.utils import SAMPLE_RATE
 
@@ -173,7 +174,8 @@ class Flite(Synthesiser):
             options = [word for name, value in settings.items() for word in ("--setf", f"{name}={value:g}")]
             printed = _run(["flite", "-voice", self.voice, *options, "-psdur", "-t", text, "-o", str(sound)])
             ends = [phone.rpartition(":")[::2] for phone in printed.split() if ":" in phone]
-            return _utterance(sound, ((name, float(end)) for name, end in ends), f"flite:{self.voice}")
+            with damaged(f'voice "{self.voice}"', "install flite again"):
+                return _utterance(sound, ((name, float(end)) for name, end in ends), f"flite:{self.voice}")
 
 
 @puppet_voice.register("festival")
@@ -208,9 +210,12 @@ class Festival(Synthesiser):
                 f' (utt.save.wave u "{sound}" "riff"))'
             )
             _run(["festival", "-b", program])
-            rows = [line.split() for line in labels.read_text().splitlines() if len(line.split()) == 3]
-            phones = _PHONES[self._phone_sets()[self.voice]]
-            return _utterance(sound, ((name, float(end)) for end, _, name in rows), f"festival:{self.voice}", phones)
+            with damaged(f'voice "{self.voice}"', "install Festival again", OSError):
+                rows = [line.split() for line in labels.read_text().splitlines() if len(line.split()) == 3]
+                phones = _PHONES[self._phone_sets()[self.voice]]
+                return _utterance(
+                    sound, ((name, float(end)) for end, _, name in rows), f"festival:{self.voice}", phones
+                )
 
 
 @lru_cache
@@ -241,9 +246,6 @@ def _utterance(
     sound: Path, ends: Iterable[tuple[str, float]], voice: str, phones: Mapping[str, str] = CMU_PHONES
 ) -> Utterance:
     """A sound file at 16 kHz with its phones, which are given by name and end in seconds."""
-    import soundfile
-    import soxr
-
     phonemes, start = [], 0.0
     for name, end in ends:
         if end > start:
@@ -252,9 +254,7 @@ def _utterance(
         start = max(start, end)
     if not sound.is_file() or not any(phoneme.ipa for phoneme in phonemes):
         raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')
-    native, rate = soundfile.read(sound, dtype="float32")
-    samples = native if rate == SAMPLE_RATE else soxr.resample(native, rate, SAMPLE_RATE, quality="HQ")
-    return Utterance(np.asarray(samples, dtype=np.float32), tuple(phonemes))
+    return Utterance(read_speech(sound), tuple(phonemes))
 
 
 def coloured_speech(samples: NDArray[np.float32], loudness: float, brightness: float) -> NDArray[np.float32]:

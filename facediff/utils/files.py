@@ -463,6 +463,13 @@ def locked(path: Path, command: str) -> Iterator[None]:
         yield
 
 
+def remove_lock(path: Path) -> None:
+    """Remove the lock file of a process that was killed; one that is held stays."""
+    if path.is_file():
+        with suppress(FaceDiffError, OSError), locked(path, ""):
+            pass
+
+
 class LockedError(FaceDiffError):
     """Another process is at work in a folder."""
 

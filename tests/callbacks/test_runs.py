@@ -12,8 +12,9 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger
 
 from facediff.callbacks import LastCheckpoint, checkpoints
-from facediff.callbacks.runs import continued_run, entered_run, find_checkpoint, run_folder
+from facediff.callbacks.runs import LOCK, continued_run, entered_run, find_checkpoint, run_folder
 from facediff.utils import files
+from facediff.utils.files import locked
 
 
 def test_what_a_run_that_was_killed_in_its_first_save_left_is_swept(tmp_path: Path) -> None:
@@ -21,13 +22,24 @@ def test_what_a_run_that_was_killed_in_its_first_save_left_is_swept(tmp_path: Pa
     checkpoints.mkdir(parents=True)
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    own = files._partial(checkpoints / "last.ckpt", ".ckpt")
-    left = own.with_name(own.name.replace(f"-{own.name.split('-')[2]}-", f"-{ended.pid}-"))
-    for path in (own, left):
+    places = (checkpoints / "last.ckpt", checkpoints.parent / "config.yaml")
+    own = [files._partial(place, place.suffix) for place in places]
+    left = [path.with_name(path.name.replace(f"-{path.name.split('-')[2]}-", f"-{ended.pid}-")) for path in own]
+    for path in (*own, *left, checkpoints.parent / LOCK):
         path.write_bytes(b"x")
     trainer = Trainer(logger=CSVLogger(tmp_path, name="small"), accelerator="cpu", enable_progress_bar=False)
     with entered_run(trainer, []):
-        assert [*checkpoints.iterdir()] == [own]  # this process is at work
+        found = {path for path in checkpoints.parent.rglob("*") if path != checkpoints}
+        assert found == {*own}  # this process is at work
+
+
+def test_the_lock_of_a_run_that_goes_on_stays(tmp_path: Path) -> None:
+    others = tmp_path / "small" / "version_0" / LOCK
+    with locked(others, "facediff fit"):
+        trainer = Trainer(logger=CSVLogger(tmp_path, name="small"), accelerator="cpu", enable_progress_bar=False)
+        with entered_run(trainer, []):
+            assert others.is_file()
+            assert (tmp_path / "small" / "version_1" / LOCK).is_file()
 
 
 @pytest.mark.parametrize(("name", "logs"), [("SIGTERM", True), ("SIGUSR1", True), ("SIGUSR1", False)])

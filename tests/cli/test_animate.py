@@ -10,7 +10,9 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -18,10 +20,11 @@ import pytest
 import soundfile
 import torch
 
-from facediff.animation import read_archive
+from facediff.animation import Animation, read_archive
 from facediff.cli.app import main
 from facediff.mesh import read_mesh
 from facediff.models import DualPathDiffusion, load_model
+from facediff.pipelines.animate import AnimationPipeline
 from facediff.speech.audio import read_speech
 from tests.fakes.processes import Forked, program
 from tests.fakes.waiting import wait_until, wait_until_read
@@ -50,6 +53,22 @@ def test_npy_holds_absolute_vertices_and_repeats_bit_for_bit(speech: Path, check
     assert not np.array_equal(first, third)
     template = load_model(checkpoint).assets.templates["B"].numpy()
     assert np.abs(first - template).max() < 0.2
+
+
+def test_a_model_without_styles_is_told_of(
+    speech: Path, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exported models of SelfTalk, LAM or EmoTalk take no style."""
+    write = AnimationPipeline.write
+
+    def without(self: AnimationPipeline, *arguments: Any, **options: Any) -> tuple[list[Path], Animation]:  # noqa: ANN401
+        written, made = write(self, *arguments, **options)
+        facts = {name: value for name, value in made.metadata.items() if name not in ("style", "identity")}
+        return written, replace(made, metadata=facts)
+
+    monkeypatch.setattr(AnimationPipeline, "write", without)
+    assert main(["animate", str(speech), "--checkpoint", str(checkpoint), "-o", str(tmp_path / "a.npy")]) == 0
+    assert "25 frames, licence: " in capsys.readouterr().out
 
 
 def test_the_recording_in_the_package_needs_no_other_file(

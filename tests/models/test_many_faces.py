@@ -19,6 +19,7 @@ from facediff import registry
 from facediff.callbacks import EmaWithWarmup
 from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from facediff.cli.app import main
+from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, ManyFaces, load_model
 from facediff.models.checkpoint import corpus_of, read_checkpoint
 from facediff.models.dual_path.network import TRUNK
@@ -62,6 +63,13 @@ def corpora(roots: dict[str, Path], **options: Any) -> Tiny:  # noqa: ANN401
         for name, kind in (("halved", Halved), ("weights", TinyChannels))
     }
     return Tiny(root=str(roots["tiny"]), batch_size=3, further_corpora=further, **options)
+
+
+@pytest.mark.parametrize("name", ["keys", "items", "pop", "forward", "training", "type", "x.y", "clear", "a/b", ""])
+def test_a_name_that_no_part_of_a_model_can_have_is_refused(name: str, roots: dict[str, Path]) -> None:
+    further = {name: {"corpus": f"{Halved.__module__}.{Halved.__name__}", "root": str(roots["halved"])}}
+    with pytest.raises(FaceDiffError, match="choose another"):
+        Tiny(root=str(roots["tiny"]), further_corpora=further)
 
 
 def many_faces(data: Tiny) -> ManyFaces:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from facediff.errors import FaceDiffError
 from facediff.synthetic.voices import Delivery, coloured_speech, installed_voices, open_voice
 
 FLITE = """#!{python}
@@ -70,6 +71,30 @@ def test_flite_says_when_each_phoneme_is_spoken(flite: Path) -> None:
     ]
     slower = voice.speak("much", Delivery(rate=0.5))
     assert slower.phonemes[-1].end == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "to"),
+    [
+        ("{{end * stretch:.3f}}", "a"),
+        ("{{end * stretch:.3f}}", "nan"),
+        ('"wb") as sound', '"wb") as sound, open("/dev/null") as _'),
+        ("int(8000 * 0.6 * stretch)", "0"),
+        ("setnchannels(1)", "setnchannels(2)"),
+        ('words[words.index("-o") + 1]', '"/dev/null"'),
+    ],
+)
+def test_a_synthesiser_that_lies_is_named(
+    change: str, to: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A time that is none, no sound, an empty one; a stereo one is averaged."""
+    assert change in FLITE
+    _program(tmp_path / "bin" / "flite", FLITE.replace(change, to), monkeypatch)
+    if "channels" in change or "sound" in change:
+        assert open_voice("flite:slt").speak("much").samples.ndim == 1
+        return
+    with pytest.raises(FaceDiffError):
+        open_voice("flite:slt").speak("much")
 
 
 def test_festivals_voices_speak_in_the_phones_of_their_language(

@@ -121,7 +121,7 @@ def convert(paths: str | Path | Sequence[str | Path], options: ImportOptions) ->
     given_options = options.all_model_options()
     for prefix in given_options.pop("ignore", []):
         files.ignore(prefix, "left out as asked")
-    with damaged(files.source, "give the whole checkpoint, as its authors distribute it"):
+    with damaged(files.source, "give the whole checkpoint, as its authors distribute it", RuntimeError):
         facts = method.author_facts(files, options) or facts_of(files, options, given_options)
         if card.frame_rate:
             given_options.pop("frame_rate", None)
