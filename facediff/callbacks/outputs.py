@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import WandbLogger
 
 from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_media, worst_clips
 from facediff.data import SpeechMotionDataModule
+from facediff.errors import counted, note, number
 from facediff.models import AnimationModel
 from facediff.models.evaluation import METHODS
 from facediff.models.inference import Prediction
@@ -60,6 +61,10 @@ class EpochLines(Callback):
         print(f"epoch {trainer.current_epoch + 1}{last}: {values}, {seconds:.0f} s", file=sys.stderr, flush=True)
 
 
+MANY_STEPS = 1_000_000
+"""Steps of all animations of a test above which it takes days; a thousand take some seconds on a GPU."""
+
+
 class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
@@ -79,6 +84,24 @@ class ScoreTable(Callback):
     @checks_arguments
     def __init__(self, media_clips: Annotated[int, Range(0, 10_000)] = 8) -> None:
         self.media_clips = media_clips
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say how much is generated where that takes days: a paper's own test may."""
+        data: Any = trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(pl_module, AnimationModel) or data is None or not trainer.is_global_zero:
+            return
+        turns = len(pl_module.identities) if pl_module.unseen_identity == "each_seen" else 1
+        draws = pl_module.test_samples * (pl_module.samples and pl_module.test_samples > 1)
+        of_clip = {True: 2 + draws, False: turns * (2 + draws)}  # each once more with another clip's speech
+        splits = pl_module.evaluation.splits
+        count = sum(of_clip[clip.identity in pl_module.identities] for split in splits for clip in data.clips(split))
+        steps = int(getattr(getattr(pl_module, "sampler", None), "steps", 1))
+        if count * steps > MANY_STEPS:
+            note(
+                f"the test generates about {number(count)} animations of {counted(steps, 'sampling step')}; fewer: "
+                f"--model.unseen_identity=style_only, --model.test_samples, --trainer.limit_test_batches, or "
+                f"--model.sampler.steps"
+            )
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print and write; runs before the model logs and empties its metrics."""

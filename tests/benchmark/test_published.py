@@ -7,7 +7,14 @@ from typing import Any
 
 import pytest
 
+from facediff.benchmark.cells import cells_of, config_content, rows_of
+from facediff.benchmark.plan import read_plan
 from facediff.benchmark.published import published, shown_tables
+from facediff.benchmark.running import fit_options, option_words
+from facediff.cli.benchmark import data_class
+from facediff.cli.lightning import parse_fit
+from facediff.data import vocaset
+from facediff.utils.files import config_dir
 
 BIWI: dict[str, Any] = {
     "rows": {"ours": "FaceFormer"},
@@ -45,3 +52,36 @@ def test_printed_figures_are_those_of_the_page_on_definitions() -> None:
     scaled = [biwi["mve"] * 1e3, biwi["lve"] * 1e4, biwi["fdd"] * 1e5]
     scaled += [mead["mve"] * 1e3, mead["lve"] * 1e4, mead["fdd"] * 1e7, voca["lve"] * 1e5]
     assert scaled == pytest.approx(wanted)
+
+
+CLIPS = {
+    "biwi": [f"{speaker}_e{number:02d}" for speaker in ("F1", "F2", "F3", "F4", "M1", "M3") for number in range(1, 41)],
+    "vocaset": [f"{speaker}_sentence{n:02d}" for speaker in (*vocaset.TRAIN, *vocaset.TEST) for n in range(1, 41)],
+    "mead3d": [
+        f"{s}_{n:03d}_{e}_{0 if e == 0 else 1}" for s in ("M003", "M030") for n in range(1, 41) for e in range(8)
+    ],
+}
+"""Names of clips of each corpus, of speakers and sentences for training and tests."""
+
+
+@pytest.mark.parametrize("path", sorted((config_dir() / "benchmark").glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_data_of_a_plan_have_the_split_of_the_figures_that_it_quotes(path: Path, tmp_path: Path) -> None:
+    plan = read_plan(path)
+    tables = [published()[name] for name in plan.published]
+    rows = {row.name: row.published for row in rows_of(plan)}
+    parsed: set[str] = set()
+    for cell in cells_of(plan):
+        table = next((table for table in tables if table.corpus == cell.corpus and rows[cell.row] in table.rows), None)
+        if table is None or not cell.trainings:
+            continue
+        training = cell.trainings[-1]
+        options = {name: value for name, value in fit_options(training, {}, cell).items() if name.startswith("data")}
+        words = ["--config", str(training.config), *option_words({**options, "data.root": "nowhere"})]
+        if (data_words := f"{config_content(training.config)['data']} {words[2:]}") in parsed:
+            continue
+        parsed.add(data_words)
+        _, class_path, arguments = parse_fit(words)
+        data = data_class(class_path)(**{**arguments, "root": str(tmp_path)})
+        clips = [clip for name in CLIPS[cell.corpus] if (clip := data.parse_name(name)) is not None]
+        assert table.split in {data.split_of(clip) for clip in clips}, (cell.row, training.config)
+    assert bool(parsed) == bool(tables)
