@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,21 +49,6 @@ def test_expressivity_goes_from_the_mean_to_the_sample(checkpoint: Path, tmp_pat
     assert np.abs(sample - mean).max() > 1e-4
 
 
-@pytest.mark.slow
-def test_expressivity_by_region_fades_into_the_rest(speech: Path, checkpoint: Path) -> None:
-    sample, mean = (made(speech, checkpoint, "--expressivity", share) for share in (1, 0))
-    regions = load_model(checkpoint).assets.regions
-    found = made(speech, checkpoint, "--expressivity", "lips=0,upper_face=1")
-    # Lips and upper face of the miniature are 12 vertices each; near the border each has a part of the other.
-    lips, upper = regions["lips"].numpy(), regions["upper_face"].numpy()
-    gaps = [np.abs(found[:, lips] - mean[:, lips]).max(), np.abs(found[:, upper] - sample[:, upper]).max()]
-    assert max(gaps) < 0.6 * np.abs(sample - mean).max()
-    assert np.array_equal(found, made(speech, checkpoint, "--expressivity", "lips=0"))
-    np.testing.assert_allclose(
-        made(speech, checkpoint, "--expressivity", "lips=0.5,all=0.5"), (sample + mean) / 2, atol=1e-6
-    )
-
-
 def test_samples_are_near_their_mean_and_files_say_it(speech: Path, checkpoint: Path, tmp_path: Path) -> None:
     path = tmp_path / "two.npz"
     words = ["--samples", 2, "--expressivity", "0.5", "--guidance", "identity=1.5", "--identity", "A"]
@@ -97,16 +80,3 @@ def test_a_stream_has_the_expressivity_of_the_file(
         monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=source))
         assert animate("-", "--stream", "--checkpoint", checkpoint, "-o", tmp_path / "s.npy", *options[4:]) == 0
     assert not np.array_equal(streamed, np.load(tmp_path / "s.npy"))
-
-
-@pytest.mark.slow
-def test_a_mean_is_scored_by_test(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    def scores(*words: str) -> list[dict[str, str]]:
-        quiet = ["--trainer.accelerator=cpu", "--trainer.logger=false", f"--trainer.default_root_dir={tmp_path}"]
-        assert main(["test", "--ckpt_path", str(checkpoint), *quiet, *words]) == 0
-        return list(csv.DictReader(io.StringIO((tmp_path / "test_scores.csv").read_text())))
-
-    mean = scores("--model.expressivity=0", "--model.metrics=[sample_diversity:n_samples=2]")
-    assert {float(row["sample_diversity:n_samples=2"]) for row in mean if row["method"] == "model"} == {0.0}

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +19,6 @@ from facediff.models.published.importing import save_model
 from facediff.speech.audio import read_speech
 from tests.fakes import published_parameters
 from tests.fakes.published import AUDIO_CONFIG
-from tests.fakes.waiting import PATIENCE, wait_until_read
 
 WINDOWS = {"window": 0.6, "overlap": 0.2, "voice_gate": "off"}
 WORDS = ["--window", "0.6", "--overlap", "0.2", "--voice-gate", "off"]
@@ -75,25 +71,3 @@ def test_live_knows_how_late_a_models_own_windows_are(method: str, tmp_path: Pat
             hops.append(given)
     assert max(waits) == pytest.approx(model.look_ahead, abs=0.6 / model.frame_rate)  # in whole frames
     assert hops[-1] / model.frame_rate == pytest.approx(model.hop)
-
-
-@pytest.mark.slow
-def test_interrupt_ends_with_the_report_and_status_0(checkpoint: Path, tmp_path: Path) -> None:
-    """In a real process that waits for samples, with a file that appears whole."""
-    out = tmp_path / "out.jsonl"
-    words = [str(checkpoint), "-", "--to", f"jsonl:{out}?weights=false", *WORDS]
-    command = [sys.executable, "-m", "facediff", "live", *words]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stderr is not None
-        assert process.stdin is not None
-        while b"ready" not in process.stderr.readline():
-            assert process.poll() is None
-        process.stdin.write(np.zeros(32_000, "<i2").tobytes())
-        process.stdin.flush()
-        wait_until_read(process.stdin, process.pid)
-        process.send_signal(signal.SIGINT)
-        said = process.stderr.read()
-        assert process.wait(PATIENCE) == 0
-    assert b" frames of 2.0 s" in said
-    lines = out.read_text().splitlines()
-    assert json.loads(lines[-1])["type"] == "end"

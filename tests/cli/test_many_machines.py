@@ -25,19 +25,6 @@ SWEEP = ROOT / "configs" / "sweep" / "puppet.yaml"
 NO_GPU = not torch.cuda.is_available()
 
 
-@pytest.mark.slow
-def test_tensorboard_writes_into_the_folder_of_the_run(
-    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("tensorboard")
-    monkeypatch.chdir(tmp_path)
-    assert fit("--config", "configs/logger/tensorboard.yaml") == 0
-    run = tmp_path / "runs" / "puppet" / "version_0"
-    assert list(run.glob("events.out.tfevents.*"))
-    assert (run / "metrics.csv").is_file()
-    assert (run / "checkpoints" / "best.ckpt").is_file()
-
-
 def sweep_words(**chosen: object) -> list[str]:
     """The command that an agent of Weights & Biases starts for chosen values, by its own functions."""
     utils = pytest.importorskip("wandb.sdk.launch.sweeps.utils")
@@ -124,20 +111,6 @@ def assert_equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]
     assert first.keys() == second.keys()
     for name, value in first.items():
         torch.testing.assert_close(value, second[name], rtol=0, atol=0)
-
-
-@pytest.mark.slow
-def test_two_nodes_of_torchrun_train_as_two_processes_of_one_machine(tiny_root: Path, tmp_path: Path) -> None:
-    port = free_port()
-    node = ["-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1", "--master-addr=127.0.0.1"]
-    train = words_of(tiny_root, tmp_path / "nodes", "--trainer.num_nodes=2", "--trainer.devices=1")
-    nodes = [
-        started([sys.executable, *node, f"--master-port={port}", f"--node-rank={rank}", *train]) for rank in range(2)
-    ]
-    assert "MEMBER: 2/2" in finished(nodes, 0, 0)
-    finished([started([sys.executable, *words_of(tiny_root, tmp_path / "one", "--trainer.devices=2")])], 0)
-    assert_equal(weights(tmp_path / "nodes"), weights(tmp_path / "one"))
-    assert not (tmp_path / "nodes/puppet/version_1").exists()  # both nodes write to the run's one folder
 
 
 @pytest.mark.slow

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -238,23 +236,6 @@ def test_a_batch_takes_the_keys_of_each_recording(
         animate_folder(replace(options, expressivity="0.5"), **run)
     with pytest.raises(FaceDiffError, match=r"b\.csv: channel expressivity: .*--expressivity"):
         model.animate(recordings / "b.wav", direction=recordings, expressivity=0.5, **QUICK)
-
-
-@pytest.mark.slow
-def test_command_follows_keys(workplace: Path) -> None:
-    Path("keys.json").write_text(json.dumps({"keys": rows("style", "F1_e03", "M2_e05") + rows("brows", 0, 3)}))
-    command = [sys.executable, "-m", "facediff", "animate", "speech.wav", "--checkpoint", "demo/puppet.ckpt"]
-    made = subprocess.run(
-        [*command, "--steps", "1", "--direction", "keys.json", "--acting", "prosody", "-o", "a.npz", "--quiet"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert made.returncode == 0, made.stderr
-    metadata = read_archive(Path("a.npz")).metadata
-    assert metadata["style"] == "F1_e03, M2_e05"
-    assert "acting" in metadata["procedural"]
 
 
 def test_timecodes_count_the_frames_of_the_animation(
