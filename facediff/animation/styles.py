@@ -37,6 +37,9 @@ CANCELLED = 1e-3
 """Weights that sum to less than this share of their sizes leave nothing to divide by."""
 OTHER_FACE = 0.25
 """How far the stillest vertices may lie from the face, as a share of how far all vertices of a reference do."""
+LEAST_STILL = 12
+"""A tracked face without a skull moves everywhere: there, the limit is three times (a quarter of 12) how far its
+stillest vertices move. Clips of one person reach 2.2 times that, the mean face as a template 5.9 times."""
 OTHER_ENCODER = 0.1
 """How far two encoders' answers to a still face may lie apart, as a share of their length, to be of one model."""
 NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)"
@@ -171,7 +174,8 @@ class Stillness:
 
     Attributes:
         vertices: the quarter of the vertices that move least in the stored references.
-        size: how far vertices move in these references, as a root mean square of offsets from the template.
+        size: how far vertices move in these references, as a root mean square of offsets from the template; or
+            LEAST_STILL times how far those that move least do, if that is more.
     """
 
     vertices: npt.NDArray[np.int64]
@@ -180,7 +184,7 @@ class Stillness:
     def another_face(self, offsets: Array) -> bool:
         """Whether offsets (T, V, 3) from a template are of another face than the template's, or the head moves."""
         # Where faces keep still, offsets from one's own template are small. Those from another speaker's are not.
-        return float(np.sqrt(np.square(offsets[:, self.vertices]).mean())) > OTHER_FACE * self.size
+        return rms(offsets[:, self.vertices]) > OTHER_FACE * self.size
 
 
 def stillness_of(motions: Sequence[Array]) -> Stillness | None:
@@ -189,7 +193,13 @@ def stillness_of(motions: Sequence[Array]) -> Stillness | None:
         return None
     reach = np.max([np.linalg.norm(motion, axis=-1).max(0) for motion in motions], 0)
     still = np.argsort(reach, kind="stable")[: max(1, len(reach) // 4)]
-    return Stillness(still, max(float(np.sqrt(np.square(motion).mean())) for motion in motions))
+    sizes = [max(rms(motion), LEAST_STILL * rms(motion[:, still])) for motion in motions]
+    return Stillness(still, max(sizes))
+
+
+def rms(values: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.square(values).mean()))
 
 
 def recorded_parameters(source: str, frame_rate: float) -> ParameterClip | None:

@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from facediff.animation import Animation, write_archive
-from facediff.animation.styles import Weighted, marked, split_styles, style_paths
+from facediff.animation.styles import Weighted, marked, split_styles, stillness_of, style_paths
 from facediff.data import Reference
 from facediff.errors import FaceDiffError
 from facediff.models import DiffPoseTalk, DualPathDiffusion, Style, import_checkpoint
@@ -38,6 +38,17 @@ def vector(style: Reference | Style, model: DualPathDiffusion) -> np.ndarray:
     motion = style.motion.float()[None]
     with torch.inference_mode():
         return model.encode_style(motion, torch.ones(motion.shape[:2], dtype=torch.bool))[0].numpy()
+
+
+def test_a_face_without_a_skull_is_known_by_its_stillest_vertices() -> None:
+    """Faces from videos tremble everywhere; another person's neutral face is farther away than that."""
+    random = np.random.default_rng(0)
+    motions = random.normal(0, 0.3, (3, 40, 50, 3)).astype(np.float32)
+    motions[:, :, :10] += 2 * np.sin(np.arange(40) / 3)[None, :, None, None]
+    stillness = stillness_of([motions[0]])
+    assert stillness is not None
+    assert not any(stillness.another_face(motion) for motion in motions)
+    assert stillness.another_face(motions[1] + random.normal(0, 1.2, (50, 3)).astype(np.float32))
 
 
 def test_a_vector_of_another_model_is_refused(
