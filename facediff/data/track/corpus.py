@@ -410,14 +410,14 @@ def warnings(recordings: Sequence[tuple[Recording, RecordingSummary]], clips: Se
     for recording, summary in recordings:
         name = recording.source.name
         if summary.face_pixels < SMALL_FACE:
-            yield f"{name}: the face is {summary.face_pixels:.0f} pixels wide; film nearer: from {SMALL_FACE} on it is exact"
+            yield f"{name}: the face is {summary.face_pixels:.0f} pixels wide; {SMALL_FACE} are exact: film nearer"
         if recording.frame_rate < SLOW:
-            yield f"{name}: {recording.frame_rate:.1f} frames a second; closures of 60 ms are missed below {SLOW}: film faster"
+            yield f"{name}: {recording.frame_rate:.1f} frames a second; below {SLOW}, closures of 60 ms are missed"
         if recording.repeated > REPEATED * len(recording.times):
             yield f"{name}: {recording.repeated} pictures are repeated; use the recording before it was converted"
     gaps = np.concatenate([clip.gaps for clip in clips])
     if np.mean(gaps > CLOSED) > OPEN:
-        yield "the mouth is open in more than 90 % of the frames: the neutral face may be wrong; film closed lips as well"
+        yield "the mouth is open in more than 90 % of the frames, and the neutral face perhaps; film closed lips too"
     if len(clips) == 1:
         yield "a person's only clip belongs to no split; more video gives more clips"
     ratio = float(np.median([clip.difference_ratio for clip in clips]))

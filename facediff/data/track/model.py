@@ -64,11 +64,11 @@ def read_face_model(path: Path | None) -> FaceModel:
         raise FaceDiffError(f"{path or '--model'}: no face model; {OBTAIN}")
     try:
         with zipfile.ZipFile(path) as archive:
-            graphs = [network(archive, name) for name in SHAPES]
+            detector, landmarker = (network(archive, name) for name in SHAPES)
             canonical, triangles, weights = read_geometry(archive.read(GEOMETRY))
     except (zipfile.BadZipFile, LookupError, ValueError, StopIteration, struct.error) as error:
         raise FaceDiffError(f"{path}: is not the face landmarker that was expected ({error}); {OBTAIN}") from error
-    return FaceModel(*graphs, canonical, triangles, weights, hashlib.sha256(path.read_bytes()).hexdigest())
+    return FaceModel(detector, landmarker, canonical, triangles, weights, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def network(archive: zipfile.ZipFile, name: str) -> bytes:

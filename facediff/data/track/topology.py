@@ -36,7 +36,7 @@ Triangles = npt.NDArray[np.int64]
 def without_webs(triangles: Triangles) -> Triangles:
     """Triangles (F, 3) without those across the mouth and the eyes: 852 of the 898 of the file."""
     inside = [np.isin(triangles, rim).all(axis=1) for rim in (INNER_LIPS, RIGHT_LIDS, LEFT_LIDS)]
-    return np.asarray(triangles[~np.any(inside, axis=0)])
+    return triangles[~np.any(inside, axis=0)]
 
 
 def sharpness(triangles: Triangles, count: int) -> npt.NDArray[np.float64]:

@@ -126,8 +126,8 @@ def test_videos_that_cannot_be_used(
     ("looks", "options", "warning"),
     [
         ([Look(0.5 + 0.4 * look.gap) for look in talking(4)], {}, "the mouth is open in more than 90 % of the frames"),
-        (talking(4, scale=0.25), {}, "; from 80 on it is exact"),
-        (talking(4), {"times": np.arange(100) / 20}, "20.0 frames a second; closures of 60 ms are missed"),
+        (talking(4, scale=0.25), {}, "; 80 are exact: film nearer"),
+        (talking(4), {"times": np.arange(100) / 20}, "20.0 frames a second; below 24, closures of 60 ms are missed"),
         ([look for look in talking(2) for _ in range(2)], {}, "pictures are repeated; use the recording before"),
         (talking(4), {}, "a person's only clip belongs to no split"),
         (talking(4), {}, "the face model has SHA-256 000"),
