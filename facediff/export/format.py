@@ -18,7 +18,7 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions, Up
 from facediff.errors import FaceDiffError
-from facediff.mesh.textures import Textures, read_textures
+from facediff.mesh.textures import Material, Textures, read_textures
 from facediff.render.meshes import face_outward, vertex_normals
 from facediff.utils.colours import to_linear
 
@@ -159,13 +159,13 @@ def surface_of(animation: Animation, options: ExportOptions) -> Textures | None:
 
 def pictures_of(surface: Textures, stem: str) -> dict[int, tuple[str, bytes]]:
     """Names and bytes of the pictures of a surface's materials, by their numbers; one file for each picture."""
-    names: dict[Path | bytes, str] = {}
-    result = {}
-    for number, material in enumerate(surface.materials):
-        if material.picture is not None and (picture := material.picture_bytes()) is not None:
-            name = names.setdefault(material.picture, f"{stem}_{len(names)}{picture[2]}")
-            result[number] = (name, _marked(picture[0]))
-    return result
+    files: dict[Path | bytes, tuple[str, bytes] | None] = {}  # materials that share a picture share its bytes
+    for picture in dict.fromkeys(material.picture for material in surface.materials if material.picture is not None):
+        content = Material("", picture=picture).picture_bytes()
+        names = sum(file is not None for file in files.values())
+        files[picture] = None if content is None else (f"{stem}_{names}{content[2]}", _marked(content[0]))
+    found = {number: files.get(material.picture or b"") for number, material in enumerate(surface.materials)}
+    return {number: file for number, file in found.items() if file is not None}
 
 
 def _marked(picture: bytes) -> bytes:

@@ -45,6 +45,7 @@ class Glb:
 
     def __init__(self, data: bytes, source: object) -> None:
         self.source = source
+        self._pieces: dict[object, bytes] = {}
         if data[:8] != b"glTF\2\0\0\0":
             raise ValueError("not a binary glTF 2.0 file")
         chunks: dict[int, bytes] = {}
@@ -133,9 +134,12 @@ class Glb:
         return np.ndarray((count, width), kind, self.binary, start + offset, (stride, kind.itemsize)).copy()
 
     def piece(self, view: object) -> bytes:
-        """The bytes of a buffer view."""
+        """The bytes of a buffer view, each once: many materials may name one picture."""
         entry = self.entry("bufferViews", view)
-        return self._slab({"bufferView": view}, TYPES[5121], whole_number(entry, "byteLength"), 1).tobytes()
+        if view not in self._pieces:
+            slab = self._slab({"bufferView": view}, TYPES[5121], whole_number(entry, "byteLength"), 1)
+            self._pieces[view] = slab.tobytes()
+        return self._pieces[view]
 
     def primitives(self, mesh: int) -> list[dict[str, Any]]:
         """The parts of a mesh."""

@@ -136,13 +136,16 @@ def _read_obj(path: Path) -> Textures | None:
     numbers_in_use = np.unique(np.array(of_face))
     every = list(names)
     materials = tuple(library.get(every[number], Material(every[number] or "surface")) for number in numbers_in_use)
-    return Textures(coordinates, table, materials, np.searchsorted(numbers_in_use, of_face), tuple(losses))
+    return Textures(
+        coordinates, table, materials, np.searchsorted(numbers_in_use, of_face), tuple(dict.fromkeys(losses))
+    )
 
 
 def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str, Material]:
     """Materials by their names; adds a sentence to ``losses`` for each missing file or picture."""
     result: dict[str, Material] = {}
-    for library in libraries:
+    pictures: dict[str, Path | None] = {}
+    for library in dict.fromkeys(libraries):
         file = _beside(path, library)
         if file is None:
             losses.append(f"the material file {library} is not in the folder of {path.name}: materials are grey")
@@ -158,8 +161,10 @@ def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str,
             elif word == "map_Kd" and name:
                 # Options such as -o 0 0 0 stand before the name, which may have spaces.
                 text = rest.split()[-1] if rest.strip().startswith("-") else rest.strip()
-                picture = _beside(path, text)
-                if picture is None or not _is_picture(picture):
+                if text not in pictures:
+                    beside = _beside(path, text)
+                    pictures[text] = beside if beside is not None and _is_picture(beside) else None
+                if (picture := pictures[text]) is None:
                     losses.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
                 else:
                     result[name] = Material(name, result[name].colour, picture)
@@ -249,7 +254,9 @@ def _read_glb(path: Path) -> Textures | None:
         replace(material, name=f"{material.name}_{number}") if counts[material.name] > 1 else material
         for number, material in enumerate(materials)
     ]
-    return Textures(table, np.concatenate(corners), tuple(unique), np.concatenate(of_face), tuple(losses))
+    return Textures(
+        table, np.concatenate(corners), tuple(unique), np.concatenate(of_face), tuple(dict.fromkeys(losses))
+    )
 
 
 def _material(glb: Glb, material: dict[str, Any], path: Path, losses: list[str]) -> Material:

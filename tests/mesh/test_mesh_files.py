@@ -12,7 +12,9 @@ import pytest
 import trimesh
 
 from facediff.errors import FaceDiffError
+from facediff.export.format import pictures_of
 from facediff.mesh import read_mesh
+from facediff.mesh.textures import read_textures
 
 XYZ = ["property float x", "property float y", "property float z"]
 LIST = "property list uchar int vertex_indices"
@@ -231,6 +233,24 @@ def test_nodes_place_the_meshes_of_a_glb(node: dict[str, Any], expected: list[fl
 def test_a_mirrored_mesh_keeps_its_outside(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(changed("nodes", [{"mesh": 0, "scale": [-1, 1, 1]}]))
     assert read_mesh(tmp_path / "a.glb").faces.tolist() == [[2, 1, 0], [3, 2, 0]]
+
+
+def test_materials_that_share_a_picture_share_its_bytes(tmp_path: Path) -> None:
+    """A file of megabytes may have thousands of materials with one picture, or name one file as often."""
+    picture = b"\x89PNG\r\n\x1a\n" + bytes(1000)
+    (tmp_path / "face.png").write_bytes(picture)
+    names = [f"m{number}" for number in range(50)]
+    library = "\n".join(f"newmtl {name}\nmap_Kd face.png\nmap_Kd face.png\nmap_Kd none.png" for name in names)
+    (tmp_path / "face.mtl").write_text(library)
+    faces = "\n".join(f"usemtl {name}\nf 1/1 2/2 3/3" for name in names)
+    text = "mtllib face.mtl\n" * 50 + f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n{faces}\n"
+    (tmp_path / "face.obj").write_text(text)
+    surface = read_textures(tmp_path / "face.obj", 50)
+    assert {material.picture for material in surface.materials} == {tmp_path / "face.png"}
+    assert len(surface.losses) == 1
+    files = pictures_of(surface, "face")
+    assert [name for name, _ in files.values()] == ["face_0.png"] * 50
+    assert len({id(content) for _, content in files.values()}) == 1
 
 
 SQUARE_OBJ = "# caf\u00e9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n"
