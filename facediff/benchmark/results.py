@@ -15,6 +15,7 @@ from facediff.errors import FaceDiffError
 from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import load_json, read_rows, write_json
 from facediff.utils.provenance import Provenance, provenance_of, read_provenance
+from facediff.utils.ranges import Range
 from facediff.utils.records import read_record
 from facediff.version import __version__
 
@@ -26,6 +27,10 @@ CURVES = ("val/lve", "val/energy", "val/mve")
 """Scores of validation that are kept over the steps of training."""
 
 
+COUNTS = Range(0, 1e12)
+"""Frames, sequences, weights and seconds that a result can have."""
+
+
 class Rows:
     """Rows of scores: all have a split, a method and a number of frames, and a clip if they are of a sentence."""
 
@@ -34,7 +39,9 @@ class Rows:
 
     def __contains__(self, rows: Sequence[Mapping[str, Any]]) -> bool:
         return all(
-            isinstance(row.get("frames"), int) and all(isinstance(row.get(key), str) for key in self.keys)
+            isinstance(row.get("frames"), int)
+            and all(row.get(name) in COUNTS for name in ("frames", "sequences") if name in row)
+            and all(isinstance(row.get(key), str) for key in self.keys)
             for row in rows
         )
 
@@ -83,7 +90,7 @@ class Result:
     protocol: str = ""
     definition: str = ""
     machine: Mapping[str, Any] = field(default_factory=dict)
-    measured: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    measured: Mapping[str, Mapping[str, Annotated[float, Range(0, 1e18)] | None]] = field(default_factory=dict)
     columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
     scores: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method")] = ()
     sequences: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method", "clip")] = ()
@@ -154,6 +161,8 @@ def read_result(path: Path) -> Result | None:
         for column in result.columns:
             if row.get(column) is not None and not isinstance(row[column], int | float):
                 raise FaceDiffError(f"{path}: {column} is {quoted(row[column])}; {REMEDY}")
+    if result.parameters is not None and result.parameters not in COUNTS:
+        raise FaceDiffError(f"{path}: parameters is {quoted(result.parameters)}; {REMEDY}")
     if result.provenance:
         provenance_of(result.provenance, path)
     return result

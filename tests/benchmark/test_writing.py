@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 import re
 from collections.abc import Sequence
 from html.parser import HTMLParser
@@ -14,6 +15,7 @@ import pytest
 
 from facediff.benchmark import report_of
 from facediff.benchmark.outline import read_outline, read_results, write_outline
+from facediff.benchmark.results import read_result
 from facediff.benchmark.tables import BenchmarkReport
 from facediff.benchmark.writing import (
     BEGIN,
@@ -197,3 +199,28 @@ def test_without_matplotlib_the_report_says_so_and_has_no_plot(tmp_path: Path, m
     report = made()
     assert {path.suffix for path in write_report(report, tmp_path)} == {".md", ".tex", ".html", ".csv"}
     assert "matplotlib" in (tmp_path / "made.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("scores", 0, "frames"), -1),
+        (("scores", 0, "frames"), 10**15),
+        (("scores", 0, "sequences"), -3),
+        (("sequences", 0, "frames"), -1),
+        (("provenance", "parameters"), -1),
+        (("measured", "fit", "seconds"), -1.0),
+        (("measured", "fit", "memory"), float("-1e9")),
+    ],
+)
+def test_counts_that_no_run_has_are_refused(place: tuple[str | int, ...], value: float, tmp_path: Path) -> None:
+    path = next(iter(results(effects=(0.0,), of_runs=0.01))).write(tmp_path)
+    content = json.loads(path.read_text())
+    holder = content
+    for key in place[:-1]:
+        holder = holder.setdefault(key, {}) if isinstance(holder, dict) else holder[key]
+    assert read_result(path) is not None
+    holder[place[-1]] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(FaceDiffError, match=path.name):
+        read_result(path)
