@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -62,16 +61,6 @@ def wild(frames: int = 12) -> np.ndarray:
     return np.random.default_rng(3).uniform(-0.6, 1.6, (frames, len(NAMES)))
 
 
-def test_known_weights_come_back() -> None:
-    made = shapes()
-    known = np.random.default_rng(2).uniform(0, 1, (30, 5))
-    known[:5], known[5:8] = 0.0, 1.0
-    found = solve(animation_of(made, known), made, PLAIN)
-    assert np.abs(found.values - known).max() < 1e-7
-    assert found.residual_share.max() < 1e-7
-    assert found.metadata["solve converged"] == "yes"
-
-
 def test_known_weights_come_back_from_a_motion_as_stored() -> None:
     made = shapes(vertices=1000)
     made = replace(made, neutral=made.neutral.astype(np.float32).astype(np.float64))
@@ -110,24 +99,6 @@ def test_the_optimality_conditions_hold(options: SolveOptions, rate: float) -> N
     assert (slope[high] < 1e-6).all()
 
 
-def test_no_choice_of_bounds_is_better() -> None:
-    """Every way to hold weights at 0 or 1 is tried on single frames; the best admissible one is the answer."""
-    made = shapes(seed=5)
-    animation = animation_of(made, wild(6), off=0.003)
-    found = solve(animation, made, PLAIN).values
-    flat = made.deltas.reshape(5, -1)
-    for frame, values in zip(animation.vertices, found, strict=True):
-        goal = (frame - animation.template).ravel()
-        best = np.inf
-        for choice in itertools.product((0.0, 1.0, None), repeat=5):
-            free = [k for k, value in enumerate(choice) if value is None]
-            w = np.array([value or 0.0 for value in choice])
-            w[free] = np.linalg.lstsq(flat[free].T, goal - w @ flat, rcond=None)[0]
-            if (w >= 0).all() and (w <= 1).all():
-                best = min(best, np.square(goal - w @ flat).sum())
-        assert np.square(goal - values @ flat).sum() == pytest.approx(best, rel=1e-9)
-
-
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000), size=st.sampled_from([0.0, 1e-6, 0.01, 10.0]), smooth=st.sampled_from([0.0, 0.5]))
 def test_any_motion_stays_in_bounds_and_settles(seed: int, size: float, smooth: float) -> None:
@@ -154,39 +125,6 @@ def test_the_residual_is_what_the_shapes_do_not_span() -> None:
     assert found.residual_max_mm == pytest.approx(away.max(axis=1), rel=1e-5)
     moved = np.square(animation.vertices + extra - animation.template).sum(-1).mean()
     assert found.residual_share == pytest.approx(found.residual_rms_mm / (1000 * np.sqrt(moved)))
-
-
-def test_smoothness_is_over_the_whole_animation_and_shifts_nothing() -> None:
-    """Inside the bounds the answer is one linear model's; read backwards, it is the same."""
-    made = shapes()
-    known = 0.5 + 0.3 * np.sin(np.arange(20)[:, None] / 3 + np.arange(5))
-    options = SolveOptions(smoothness=0.5, lower=-9, upper=9, sparsity=0, residual_limit=9)
-    animation = animation_of(made, known, off=0.001)
-    found = solve(animation, made, options).values
-    hessian, right = dense(made, animation, options)
-    assert found.ravel() == pytest.approx(np.linalg.solve(hessian, right), abs=1e-6)
-    back = solve(replace(animation, vertices=animation.vertices[::-1]), made, options).values
-    assert back[::-1] == pytest.approx(found, abs=1e-6)
-    rough = solve(animation, made, PLAIN).values
-    assert np.square(np.diff(found, axis=0)).sum() < 0.9 * np.square(np.diff(rough, axis=0)).sum()
-
-
-def test_symmetry_draws_left_and_right_together() -> None:
-    made = shapes()
-    known = np.tile([0.5, 0.9, 0.1, 0.2, 0.3], (4, 1))
-    gaps = [
-        np.abs(
-            np.subtract(
-                *solve(animation_of(made, known), made, SolveOptions(symmetry=s, sparsity=0, residual_limit=9))
-                .values[:, 1:3]
-                .T
-            )
-        ).max()
-        for s in (0.0, 0.5, 1e4)
-    ]
-    assert gaps[0] > 0.79
-    assert gaps[0] > gaps[1] > gaps[2]
-    assert gaps[2] < 1e-3
 
 
 def test_weights_do_not_depend_on_the_unit() -> None:
