@@ -1,6 +1,6 @@
 """A speaking style as it is given: the text of ``--style``, its files, motion, style vectors, and mixtures of these.
 
-For models with and without PyTorch alike: :class:`StyleReader` asks the model for what it alone can say.
+For models with and without PyTorch alike: :class:`StyleReader` asks a model for its names, faces and encoder.
 """
 
 from __future__ import annotations

@@ -36,8 +36,8 @@ def benchmark(
     """Train and score the methods of a plan on its corpora with its seeds, and write the tables.
 
     PLAN is a YAML file; those that come with facediff are configs/benchmark/quick.yaml and others. Each cell, a method
-    on a corpus with a seed, is trained and tested in processes of its own, several cells at a time. What is done is
-    not done again: after any interruption, the same command continues. A cell that fails stops no other.
+    on a corpus with a seed, is trained and tested in processes of its own, several cells at a time. Nothing is
+    done twice: after any interruption, the same command continues. A cell that fails stops no other.
     Exit status: 0 all done, 1 some cells failed, 2 something to put right.
 
     For example:

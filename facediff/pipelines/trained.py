@@ -58,7 +58,7 @@ class TrainedPipeline(AnimationPipeline):
 
     Args:
         options: the choices.
-        model: a model that is loaded already, on its device; it keeps what the options choose. None to load the
+        model: a model that is loaded already, on its device; it keeps the choices of the options. None to load the
             checkpoint.
     """
 

@@ -93,7 +93,7 @@ class TrackingReport:
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should look at, a line each."""
+        """Points for the user to look at, a line each."""
         version = f"the face model has SHA-256 {self.digest}; the limits of tracking were measured with {SHA256}"
         people = [f"{person.name}: {text}" for person in self.people for text in person.warnings]
         return [f"warning: {text}" for text in [*([] if self.digest == SHA256 else [version]), *people]]
