@@ -304,6 +304,11 @@ class AnimationPipeline(ABC):
         into = target if own_shapes or is_dressed or hands_on_textures(target, output) else None
         with self.animations(recording, output, seed=seed) as animations:
             z_up = self.retarget is not None and self.retarget.z_up
+            if output.suffix == ".html" and recording.path:  # the page tells how the take is made again
+                animations = [
+                    replace(one, metadata={**one.metadata, "recording": valid_text(recording.path)})
+                    for one in animations
+                ]
             written = write_animations(output, animations, export, into=into, own_shapes=own_shapes, z_up=z_up)
             return written, animations[0]
 

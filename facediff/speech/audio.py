@@ -445,12 +445,14 @@ class SpeechRecording:
         speech: (S,) float32 mono at 16 kHz, which models hear.
         sound: (N,) float32 mono, which is played and written with the animation.
         rate: sample rate of the sound in Hz.
+        path: of its file; empty if there is none.
     """
 
     name: str
     speech: npt.NDArray[np.float32]
     sound: npt.NDArray[np.float32]
     rate: int
+    path: str = ""
 
     @property
     def seconds(self) -> float:
@@ -468,7 +470,7 @@ class SpeechRecording:
 
 def read_recording(path: Path, max_seconds: float | None = None) -> SpeechRecording:
     """A wav, flac, ogg, mp3 or video file, to animate."""
-    return SpeechRecording.of(*_read(path, str(path), max_seconds), path.stem, str(path))
+    return replace(SpeechRecording.of(*_read(path, str(path), max_seconds), path.stem, str(path)), path=str(path))
 
 
 def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:

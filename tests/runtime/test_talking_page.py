@@ -176,13 +176,13 @@ def test_an_example_of_the_site_is_animated_as_a_chosen_file(page: Page) -> None
 
 
 def test_the_head_sways_while_it_speaks_unless_that_is_switched_off(page: Page) -> None:
-    lean = "(facediff.page.stage.sway({}), Math.max(...facediff.page.stage.camera.lean.map(Math.abs)))"
+    lean = "(facediff.page.stage.sway({}), Math.max(...facediff.page.stage.lean.map(Math.abs)))"
     assert page.evaluate(lean.format("null")) == page.evaluate(lean.format(0)) == 0
     most = max(page.evaluate(lean.format(time)) for time in range(1, 20))
     assert np.deg2rad(0.5) < most < np.deg2rad(2.5)
     page.evaluate("document.getElementById('sway').click()")
     page.evaluate("facediff.page.show(new Float32Array(facediff.page.size), 5)")
-    assert page.evaluate("facediff.page.stage.camera.lean") == [0, 0]
+    assert page.evaluate("facediff.page.stage.lean") == [0, 0]
     page.evaluate("document.getElementById('sway').click()")
 
 

@@ -185,6 +185,7 @@ def test_keys_are_added_dragged_changed_removed_undone_and_saved(show: Show, tmp
     assert saved.name == "clicks_keys.json"
     assert read_direction(saved).rows() == wanted.rows()
     command = page.evaluate("document.getElementById('command').textContent")
+    assert command.startswith("facediff animate SPEECH.wav --still --checkpoint ")
     assert "--identity nobody" in command
     assert "--blinks 12 --eyes 'my eyes.json' --direction clicks_keys.json" in command
     for _ in range(12):

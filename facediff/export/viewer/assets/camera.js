@@ -9,7 +9,6 @@ class Camera {
     this.onMove = onMove;
     this.pointers = new Map();
     Object.assign(this, START);
-    this.lean = [0, 0]; // of the head that it looks at
     element.addEventListener("pointerdown", (event) => this.press(event, element));
     element.addEventListener("pointermove", (event) => this.drag(event, element));
     for (const name of ["pointerup", "pointercancel"]) {
@@ -87,8 +86,7 @@ class Camera {
     const [halfWidth, halfHeight, halfDepth] = extent;
     const distance = 1.08 * Math.max(halfHeight, Math.max(halfWidth, 0.75 * halfDepth) / aspect) / slope + halfDepth;
     const reach = Math.hypot(halfWidth, halfHeight, halfDepth) * 4;
-    const yaw = this.yaw + this.lean[0], pitch = this.pitch + this.lean[1];
-    const cy = Math.cos(yaw), sy = Math.sin(yaw), cp = Math.cos(pitch), sp = Math.sin(pitch);
+    const cy = Math.cos(this.yaw), sy = Math.sin(this.yaw), cp = Math.cos(this.pitch), sp = Math.sin(this.pitch);
     // Camera axes in the face's: to the right, up, and from the face to the camera.
     const right = [cy, 0, -sy];
     const up = [-sp * sy, cp, -sp * cy];

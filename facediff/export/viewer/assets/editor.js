@@ -426,7 +426,7 @@ class Editor {
   /** The command that animates again with the keys. Only what the page knows is in it. */
   showCommand() {
     const { metadata } = this.facts.animations[this.number];
-    const words = ["facediff", "animate", "SPEECH.wav", "--checkpoint", quoted(metadata.checkpoint ?? "CHECKPOINT")];
+    const words = ["facediff", "animate", quoted(metadata.recording ?? "SPEECH.wav"), "--still", "--checkpoint", quoted(metadata.checkpoint ?? "CHECKPOINT")];
     const directed = this.direction.of("style").length > 0; // then the style of the take is not one for all of it
     for (const name of ["identity", ...(directed ? [] : ["style"]), "seed", "expressivity", "guidance"]) {
       if (/^[\w.=,-]+$/.test(metadata[name] ?? "")) words.push(`--${name}`, metadata[name]); // not "zoe (not trained on)"

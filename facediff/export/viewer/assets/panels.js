@@ -1,15 +1,14 @@
 // The controls, and the labels over the faces.
 
 /** Pixels that a panel's words need: across beside the face, or above and below it together. */
-const WORDS = { across: 150, upright: 90 };
+const ACROSS = 150, UPRIGHT = 90;
 
 /** Columns of the grid in which `count` faces, a little taller than wide, become largest. */
 function columnsFor(count, width, height) {
   let best = 1, most = 0;
-  for (let columns = 1; columns <= count; columns++) {
+  for (let columns = 1; columns <= Math.min(count, Math.ceil(width / 250)); columns++) {
     const wide = width / columns, high = height / Math.ceil(count / columns);
-    const beside = Math.min(wide - 2 * WORDS.across, 0.8 * high);
-    const size = Math.max(beside, Math.min(wide, 0.8 * (high - WORDS.upright)));
+    const size = Math.max(Math.min(wide - 2 * ACROSS, 0.8 * high), Math.min(wide, 0.8 * (high - UPRIGHT)));
     if (size > most * 1.001) [best, most] = [columns, size];
   }
   return best;

@@ -31,6 +31,7 @@ class Stage {
     this.pace = new Pace(frameRate);
     this.fresh = true; // positions that are not on the graphics card yet
     this.performing = false;
+    this.lean = [0, 0]; // how far the head is turned and tilted
     new ResizeObserver(() => this.stir()).observe(canvas);
     this.tick();
   }
@@ -66,7 +67,7 @@ class Stage {
   sway(time) {
     const at = (...rates) => rates.reduce((sum, rate, n) => sum + Math.sin(2 * Math.PI * rate * (time ?? 0) + 2 * n) / (n + 1), 0);
     const share = time === null ? 0 : 0.02 * Math.min(1, time); // radians
-    this.camera.lean = [share * at(0.13, 0.31, 0.57), 0.7 * share * at(0.19, 0.43, 0.71)];
+    this.lean = [share * at(0.13, 0.31, 0.57), 0.7 * share * at(0.19, 0.43, 0.71)];
     this.dirty = true;
   }
 
@@ -98,7 +99,10 @@ class Stage {
       this.shown += 1;
     }
     this.scene.resize(still ? this.scene.finest : this.performing ? this.pace.sharpness : 1);
-    this.scene.draw([{ number: 0, place: [0, 0, 1, 1] }], this.camera, this.extent, 0, this.edges);
+    const { camera } = this, { yaw, pitch } = camera;
+    Object.assign(camera, { yaw: yaw + this.lean[0], pitch: pitch + this.lean[1] }); // as if the head turned
+    this.scene.draw([{ number: 0, place: [0, 0, 1, 1] }], camera, this.extent, 0, this.edges);
+    Object.assign(camera, { yaw, pitch });
     this.fresh = this.dirty = false;
   }
 }
