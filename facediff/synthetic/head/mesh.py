@@ -71,15 +71,16 @@ class HalfQuadMesh:
         """Join loops of equal length, each to the next; from outside, the first runs clockwise round the others."""
         for outer, inner in zip(loops, loops[1:], strict=False):
             a, b = (np.append(outer, outer[0]), np.append(inner, inner[0])) if closed else (outer, inner)
-            corners = [a[:-1], b[:-1], b[1:], a[1:]] if clockwise else [a[:-1], a[1:], b[1:], b[:-1]]
+            corners = [a[:-1], b[:-1], b[1:], a[1:]] if clockwise else [b[1:], b[:-1], a[:-1], a[1:]]
             self.quads.append(np.stack(corners, axis=1))
 
-    def fan(self, loop: Index, centre: int, *, closed: bool = True) -> None:
-        """Join a loop to a point."""
+    def fan(self, loop: Index, centre: int, *, closed: bool = True, clockwise: bool = True) -> None:
+        """Join a loop to a point; from outside, the loop runs clockwise round it."""
         after = np.roll(loop, -1) if closed else loop[1:]
         before = loop if closed else loop[:-1]
         middle = np.full_like(before, centre)
-        self.quads.append(np.stack([before, middle, middle, after], axis=1))
+        first, last = (before, after) if clockwise else (after, before)
+        self.quads.append(np.stack([first, middle, middle, last], axis=1))
 
     def lid(self, loop: Index) -> None:
         """Close a loop with a row of quads from its one side to the other."""

@@ -86,7 +86,7 @@ def _add_skin(half: HalfQuadMesh, layout: Layout) -> None:
     index = half.add("skin", points, colours)
     half.groups["skin_shirt"] = index[covered]
     half.quads.append(index[layout.quads])
-    half.fan(layout.top[::-1], int(half.add("crown", [_CROWN], SKIN)[0]), closed=False)
+    half.fan(layout.top, int(half.add("crown", [_CROWN], SKIN)[0]), closed=False, clockwise=False)
 
 
 def _add_mouth(half: HalfQuadMesh, layout: Layout) -> None:
@@ -349,7 +349,7 @@ def _add_hair(half: HalfQuadMesh) -> None:
     grid = half.add("hair", points, shade[:, None] * np.array(HAIR)).reshape(HAIR_ROWS, HAIR_COLUMNS)
     half.strips(list(grid[::-1]))
     crown = half.add("hair_crown", [top], 0.92 * np.array(HAIR))
-    half.fan(grid[-1][::-1], int(crown[0]), closed=False)
+    half.fan(grid[-1], int(crown[0]), closed=False, clockwise=False)
 
 
 def _add_brow(half: HalfQuadMesh) -> None:
