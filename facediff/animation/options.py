@@ -296,8 +296,9 @@ class ExportOptions(CheckedOptions):
         tolerance: for .glb: largest error in mm
         surface: for .obj, .glb, .usdc and .usda: the .obj or .glb of the animation's mesh, whose texture coordinates,
             materials and pictures are written (default: the target mesh)
-        view: for .mp4: camera
-        size: for .mp4: height and width in pixels
+        view: for videos: camera
+        size: for videos: height and width in pixels; a .gif has a third of it
+        video_rate: for videos: pictures a second, with motion interpolated between frames (default: its frame rate)
         footer: text below a video, such as "synthetic corpus"
         quiet: whether progress bars are hidden
         speech_file: name of the .wav file that is written next to the animation; None if there is none. Set by
@@ -313,7 +314,8 @@ class ExportOptions(CheckedOptions):
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.05
     surface: Annotated[FilePath | None, Option(metavar="MESH", reads=True)] = None
     view: View = "front"
-    size: Annotated[ranges.Pixels, Option(metavar="PIXELS")] = 512
+    size: Annotated[ranges.Pixels, Option(metavar="PIXELS")] = 1080
+    video_rate: Annotated[ranges.FrameRate | None, Option(metavar="F")] = None
     footer: Annotated[str, Option(hidden=True)] = ""
     quiet: Annotated[bool, Option(hidden=True)] = True
     speech_file: Annotated[str | None, Option(hidden=True)] = None
@@ -511,3 +513,4 @@ class ExportKeywords(TypedDict, total=False):
     surface: FilePath | None
     view: View
     size: int
+    video_rate: float | None

@@ -114,7 +114,7 @@ def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModu
         ]
         path = folder / f"truth_and_prediction_{split}.mp4"
         footer = f"{model.assets.corpus}: synthetic corpus"
-        write_animations(path, animations, ExportOptions(footer=footer, quiet=False))
+        write_animations(path, animations, ExportOptions(footer=footer, size=512, quiet=False))
         write_sheet(path.with_suffix(".png"), animations, footer)
         written += [path, path.with_suffix(".png")]
     return written

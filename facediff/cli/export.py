@@ -49,7 +49,7 @@ def export(
     from facediff.pipelines.motion import SourceReader
 
     footer = ""  # under a video: the corpus, and whether it is synthetic
-    if source.checkpoint is not None and output.suffix == ".mp4":
+    if source.checkpoint is not None and "view" in getattr(FORMATS.get(output.suffix), "uses", ()):
         from facediff.pipelines.motion import corpus_of_model
 
         footer = corpus_of_model(source.checkpoint)

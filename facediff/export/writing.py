@@ -19,7 +19,7 @@ from facediff.export.sequences import RECORD
 from facediff.mesh.textures import PICTURE_SUFFIXES, has_textures
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
-OPTIONS = ("view", "size", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
+OPTIONS = ("view", "size", "video_rate", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
 """Options that some formats use."""
 
 
@@ -157,7 +157,7 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         refuse_without_blender(path)
         check_writable(path)
         path, suffix = path.with_suffix(".glb"), ".glb"
-    check_known(path, "format", [suffix], FORMATS)
+    check_known(path, "format", [suffix], [*FORMATS, ".fbx"])
     form = FORMATS[suffix]
     metres = 1.0 if options.output_unit is None else metres_per_unit(options.output_unit)
     reason = ""

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from facediff.speech.audio import SpeechRecording
     from facediff.speech.windows import WindowPlan
 
+VIDEOS = (".mp4", ".webm")
 PIXEL_SECONDS = 4e-8  # What drawing and encoding a pixel of a video takes
 
 Progress = Callable[[int, int], object]
@@ -276,7 +277,7 @@ class AnimationPipeline(ABC):
         duration = self.options.samples * seconds_of_speech
         frames = duration * self.frame_rate
         seconds = self.step_seconds * duration
-        if output.suffix == ".mp4":
+        if output.suffix in VIDEOS:
             seconds += PIXEL_SECONDS * frames * size**2
         return seconds, 12 * frames * len(self.facts["template"])
 

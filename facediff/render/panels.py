@@ -75,7 +75,6 @@ def _frames(
     # A renderer draws one picture at a time: each thread takes a set of them and gives it back.
     idle_sets = [renderers, *([renderer.twin() for renderer in renderers] for _ in range(threads - 1))]
     labelled = any(text.strip() for text in labels)
-    ground = np.hstack([renderer.backdrop[-1:] for renderer in renderers])
 
     def draw(index: int) -> Frame:
         set_of_renderers = idle_sets.pop()
@@ -86,7 +85,7 @@ def _frames(
             panels.append(_caption(panel, label, "top", INK, renderer.backdrop[:1]) if labelled else panel)
         idle_sets.append(set_of_renderers)
         row = np.hstack(panels)
-        return row if not footer else _caption(row, footer, "bottom", FAINT_INK, ground)
+        return row if not footer else _caption(row, footer, "bottom", FAINT_INK)
 
     return _in_order(draw, len(motions[0]), threads)
 

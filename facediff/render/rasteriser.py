@@ -295,12 +295,12 @@ class Camera:
 def portrait(template: Floats, regions: Mapping[str, npt.ArrayLike]) -> Floats:
     """The vertices (n, 3) that a picture is framed on: without shoulders, where the regions of the face are known.
 
-    The vertices left out lie further below the ``lips`` than the ``upper_face`` lies above them, and a tenth.
+    The vertices left out lie further below the ``lips`` than nine tenths of the way from there to the ``upper_face``.
     """
     if not {"lips", "upper_face"} <= regions.keys():
         return template
     lips, upper = (float(template[np.asarray(regions[name]), 1].mean()) for name in ("lips", "upper_face"))
-    return template[template[:, 1] > lips - 1.1 * (upper - lips)] if upper > lips else template
+    return template[template[:, 1] > lips - 0.9 * (upper - lips)] if upper > lips else template
 
 
 # The look: material, lights and background.

@@ -10,10 +10,11 @@ import av
 import numpy as np
 import numpy.typing as npt
 import pytest
+from PIL import Image
 
 from facediff.animation import Animation
 from facediff.export import ExportOptions, video, write_animations
-from facediff.export.video import drawn_frames
+from facediff.export.video import Interpolated, drawn_frames
 
 SMALL = ExportOptions(size=64)
 
@@ -34,6 +35,33 @@ def test_one_frame_for_every_frame_with_the_speech(animation: Animation, tmp_pat
     assert seen.shape[2] == 64
     face = seen[0, -64:].astype(int)
     assert np.abs(face - face[0, 0]).max() > 40, "there is something on the background"
+
+
+def test_a_video_for_web_pages_has_speech_and_a_moving_picture_has_none(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.webm", [animation], SMALL)
+    with av.open(str(tmp_path / "a.webm")) as container:
+        assert [stream.codec_context.name for stream in container.streams] == ["vp9", "opus"]
+        assert sum(1 for _ in container.decode(video=0)) == 40
+    assert write_animations(tmp_path / "a.gif", [animation], replace(SMALL, size=192)) == [tmp_path / "a.gif"]
+    with Image.open(tmp_path / "a.gif") as picture:
+        lengths = []
+        for index in range(picture.n_frames):
+            picture.seek(index)
+            lengths.append(picture.info["duration"])
+        assert picture.width == 64
+    assert sum(lengths) == pytest.approx(1000 * 40 / 30, abs=5)
+
+
+def test_a_video_may_have_more_pictures_than_frames(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.mp4", [animation], replace(SMALL, video_rate=60.0))
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].average_rate == 60
+    assert len(pictures(tmp_path / "a.mp4")) == 79
+    motion = animation.vertices
+    between = Interpolated(motion, 30.0, 60.0)
+    assert len(between) == 79
+    assert np.array_equal(between[78], motion[39])
+    assert between[7] == pytest.approx((motion[3] + motion[4]) / 2, abs=1e-7)
 
 
 def test_no_speech_is_a_silent_video(animation: Animation, tmp_path: Path) -> None:

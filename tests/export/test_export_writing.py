@@ -19,15 +19,20 @@ from facediff.errors import FaceDiffError
 from facediff.export import FORMATS, ExportOptions, check_export, write_animations
 from facediff.synthetic.known_faces import built_in_shapes
 
-OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", ".mp4", ".npz", ".npy"]
+VIDEOS = (".mp4", ".webm", ".gif")
+OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", *VIDEOS, ".npz", ".npy"]
 """Formats that need no blendshapes and no browser page."""
 ROOT = Path(__file__).parents[2]
 
 
 def test_formats_are_as_promised() -> None:
     assert {*OWN, ".html", ".csv", ".json"} == set(FORMATS)
-    assert {suffix for suffix, made in FORMATS.items() if made.holds_several} == {".mp4", ".html"}
-    assert {suffix for suffix, made in FORMATS.items() if made.speech == "in the file"} == {".mp4", ".html", ".npz"}
+    assert {suffix for suffix, made in FORMATS.items() if made.holds_several} == {*VIDEOS, ".html"}
+    assert {suffix for suffix, made in FORMATS.items() if made.speech == "in the file"} == {
+        *VIDEOS[:2],
+        ".html",
+        ".npz",
+    }
     assert {suffix for suffix, made in FORMATS.items() if not made.needs_mesh} == {
         ".pc2",
         ".mdd",
