@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, choices, damaged
-from facediff.spaces.arkit import ARKIT
+from facediff.spaces.arkit import ARKIT, LEFT_AND_RIGHT
 from facediff.utils import ranges
 from facediff.utils.hints import Range, check_number, shown
 from facediff.utils.limits import FRAME_RATES, check_format, quoted
@@ -300,39 +300,35 @@ class _Row:
     slope: Any = None
 
 
-def _mood(**values: float) -> tuple[Key, ...]:
-    return tuple(Key(0.0, name.replace("__", "."), value) for name, value in values.items())
+def _mood(shapes: Mapping[str, float], **values: float) -> tuple[Key, ...]:
+    """Keys that hold from the beginning; a shape without a side stands for both."""
+    both = {
+        f"shape.{name}{side}": value
+        for name, value in shapes.items()
+        for side in (("Left", "Right") if name in LEFT_AND_RIGHT else ("",))
+    }
+    channels = {**{name.replace("__", "."): value for name, value in values.items()}, **both}
+    return tuple(Key(0.0, name, value) for name, value in channels.items())
 
 
+# Plain enough to be told apart in a face of a hundred pixels: the corners of the mouth and the brows say most.
 MOODS = {
-    "calm": _mood(expressiveness=0.85, shape__eyeBlinkLeft=0.08, shape__eyeBlinkRight=0.08),
-    "lively": _mood(expressiveness=1.25, brows=1.0, shape__mouthSmileLeft=0.1, shape__mouthSmileRight=0.1),
+    "calm": _mood({"eyeBlink": 0.12, "mouthSmile": 0.12}, expressiveness=0.85),
+    "lively": _mood({"mouthSmile": 0.25, "cheekSquint": 0.15}, expressiveness=1.25, brows=1.5),
     "happy": _mood(
-        expressiveness=1.1,
-        brows=0.5,
-        shape__mouthSmileLeft=0.35,
-        shape__mouthSmileRight=0.35,
-        shape__cheekSquintLeft=0.3,
-        shape__cheekSquintRight=0.3,
+        {"mouthSmile": 0.75, "cheekSquint": 0.7, "eyeSquint": 0.35, "mouthDimple": 0.2}, expressiveness=1.15, brows=1.0
     ),
     "sad": _mood(
+        {"mouthFrown": 0.75, "browInnerUp": 0.9, "mouthShrugLower": 0.3, "eyeBlink": 0.22},
         expressiveness=0.75,
-        head__pitch=4.0,
-        shape__mouthFrownLeft=0.35,
-        shape__mouthFrownRight=0.35,
-        shape__browInnerUp=0.45,
-        shape__eyeBlinkLeft=0.12,
-        shape__eyeBlinkRight=0.12,
+        head__pitch=6.0,
     ),
     "angry": _mood(
+        {"browDown": 1.0, "noseSneer": 0.5, "eyeSquint": 0.4, "mouthFrown": 0.3, "mouthPress": 0.25},
         expressiveness=1.2,
-        head__pitch=2.0,
-        shape__browDownLeft=0.6,
-        shape__browDownRight=0.6,
-        shape__noseSneerLeft=0.2,
-        shape__noseSneerRight=0.2,
+        head__pitch=3.0,
     ),
-    "surprised": _mood(expressiveness=1.15, brows=4.0, shape__eyeWideLeft=0.5, shape__eyeWideRight=0.5),
+    "surprised": _mood({"eyeWide": 1.0}, expressiveness=1.15, brows=6.0),
 }
 """Keys by the name of a mood, which ``--direction`` takes in place of a file; they hold from beginning to end."""
 
