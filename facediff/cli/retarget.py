@@ -152,6 +152,8 @@ def write_transferred(
         whole_head=driven is not None,
     )
     notes = ["the named landmarks of both topologies hold the correspondence"] if len(reports) > 1 else []
+    if len(fit.hidden) and not options.part:
+        notes = ["the face was found in one of its parts by itself"]
     if driven is not None:
         notes += driven
     elif dressed and not options.add_to_mesh:

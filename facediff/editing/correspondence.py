@@ -16,7 +16,7 @@ import numpy.typing as npt
 from facediff.editing.detached_parts import detached_parts, lash_pieces
 from facediff.editing.face_features import OPPOSITE, Features, find_features
 from facediff.editing.landmarks import Landmarks
-from facediff.editing.lid_transfer import EyeLids, eye_lids
+from facediff.editing.lid_transfer import EyeLids, eye_lids, eyeball_triangles
 from facediff.editing.placing import place, place_face
 from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError
@@ -36,6 +36,8 @@ CLOSE, FAR = 0.1, 0.3
 EXACT = 0.005
 """Nearer than this share of the face's size, the place on the surface is trusted fully if the sheet is right."""
 BADLY = 0.05  # A median distance above this share of the face's size is reported as a bad fit
+ABOUT_EYE = 0.8, 0.45
+"""Lashes and tear lines reach so many widths of the eye from its middle, aside and upwards: brows begin higher."""
 LIDS_AS_ALL, LIDS_FITTED, LIDS_AT_REST = 0, 1, 2
 """What lids do: move as everything else, as on two cuts of one surface; move by their own opening; or stay at rest."""
 
@@ -81,6 +83,24 @@ class Correspondence:
         laid = Surface(self.laid.vertices, self.target_faces)
         source_surface = Surface(self.source_vertices, self.source_faces)
         return eye_lids(source_surface, laid, (source, target), at_rest=self.lids == LIDS_AT_REST)
+
+    @cached_property
+    def beside_lids(self) -> Indices:
+        """Vertices of lashes and tear lines: of pieces about an eye that are neither skin nor an eyeball."""
+        source, target = self.features
+        if source is None or target is None:
+            return np.zeros(0, np.int64)
+        face = Surface(self.source_vertices, self.source_faces)
+        balls = [eyeball_triangles(face, source, eye) for eye in (0, 1)]
+        is_ball = np.isin(self.corners[:, 0], self.source_faces[np.concatenate(balls)])
+        vertices, label = self.laid.vertices, pieces(self.laid)
+        beside = np.zeros(len(vertices), bool)
+        for eye in source.eyes:
+            if eye is not None:
+                away = np.abs(vertices - eye.centre)[:, :2] / eye.width
+                beside |= (away < ABOUT_EYE).all(axis=1)
+        outside = np.unique(label[~beside | target.skin | is_ball])
+        return np.flatnonzero(~np.isin(label, outside))
 
     @property
     def fits_badly(self) -> bool:

@@ -26,6 +26,8 @@ INSIDE, DEEP = 0.15, 0.04  # Share of a lid's vertices that may lie this share o
 UNEVEN = 0.25  # How much more of one eye's opening than of the other's may be left
 STRETCHED = 0.6  # Edges of the forehead may grow or shrink by this share more than the animation's
 FOLDED = 0.02  # Share of the forehead's moving triangles that may turn over
+ASYMMETRY = 0.3  # Faces are symmetric to less than this share of an eye's width
+BALL_SEEN = 0.3  # Of an eyeball, at least this share of its opening is in view at rest
 PIXELS = 96  # across an eye's window
 FOREHEAD, BESIDE = 1.6, 0.5
 """The forehead reaches so many widths of an eye up from the eyes, and begins so many away from the lids."""
@@ -119,6 +121,8 @@ def check_eyes(
                 f"the lids of its {('right', 'left')[torn]} eye tear: a hole of {holes[torn]:.0%} of the opening's "
                 f"height is left between them at a full blink"
             )
+        if not _mirror_images(target):
+            faults.append("its eyes were found in places that are no mirror images, so that one is wrong")
         if max(passed) > PASSED:
             faults.append(f"its upper lids pass the lower ones by {max(passed):.0%} of the opening")
         if max(inside) > INSIDE:
@@ -143,6 +147,15 @@ def check_eyes(
         folded=folded,
     )
     return figures, faults, remarks
+
+
+def _mirror_images(features: Features) -> bool:
+    """Whether both eyes lie as far from the mouth's middle, as high, and are as wide."""
+    right, left = features.eyes
+    assert right is not None and left is not None  # noqa: S101, PT018 - for type checkers
+    width = 0.5 * (right.width + left.width)
+    away = right.centre[:2] + left.centre[:2] * [1, -1] - 2 * features.mouth.centre[:2] * [1, 0]
+    return bool((np.abs(away) < ASYMMETRY * width).all() and abs(right.width - left.width) < ASYMMETRY * width)
 
 
 def fullest_blink(animation: Animation, edges: list[LidEdges]) -> tuple[int, float]:
@@ -203,6 +216,9 @@ def _still_seen(rest: Surface, posed: Array, features: Features, eye: int) -> tu
     # What faces away is the inside of a lid, or of the head, that is seen past a torn one.
     inside[:-1] |= triangle_normals(posed, rest.faces)[:, 2] < 0
     share = float(inside[pictures[1][inner]].mean())
+    # An eyeball says how much of it is seen wherever the edges of the lids were found.
+    before, after = (int(np.isin(picture, ball).sum()) for picture in pictures)
+    share = max(share, after / before) if before > BALL_SEEN * inner.sum() else share
     opening_seen = (y < top) & (y > bottom)
     columns = (inside[pictures[1]] & opening_seen).sum(axis=0)
     # A hole is three columns wide at least: corners and single pixels at the edges of triangles are none.

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from facediff.editing.face_features import Features, FrontView, find_features
 from facediff.editing.surface import Surface, nearest
+from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size
 from facediff.mesh.alignment import TUKEY
 from facediff.mesh.flame import rotations
@@ -137,6 +138,7 @@ FEW, MANY = 120, 400  # Points of the face by which starts are compared, and ref
 MOST_GROUPS, LEAST_GROUP = 8, 40
 END = 0.135  # Share of a standing figure's height that its head takes
 CONTINUED = 12  # Starts that are continued
+COLLAPSED = 0.05  # A start that shrinks to less than this share has run into a point
 LOOKED_AT = 5  # Alignments in which the mouth is searched for
 WITH_MOUTH, WITH_EYE = 0.5, 0.85
 """Factors on the distance of an alignment where these are found."""
@@ -164,9 +166,8 @@ def place_face(
         candidates = _candidates_for(
             moved, goal, points, normals, np.concatenate([identity, turns]), features.mouth.width
         )
-        least = candidates[0][0]
         for apart, start in candidates[:LOOKED_AT]:
-            if apart > 2.0 * least:
+            if apart > 2.0 * candidates[0][0]:
                 break
             back = start.inverse()
             target_features = find_features(back.apply(moved.vertices), moved.faces, features)
@@ -179,6 +180,8 @@ def place_face(
                 break
         if any(target_features is not None for _, _, target_features in tried):
             break
+    if not tried:
+        raise FaceDiffError("nothing on it is like the animation's face; give a mesh that shows one")
     _, back, target_features = min(tried, key=lambda trial: trial[0])
     refined = place(_near(moved, back, points, features), goal, back, samples=700, rounds=30)
     if target_features is not None:
@@ -232,19 +235,21 @@ def _candidates_for(
     few, many = some[:FEW], some[:MANY]
     rotation, shift, scale = _starts(moved, goal, points, turns)
     unrotated = np.abs(rotation - np.eye(3)).max(axis=(1, 2)) < 1e-9
-    state = (rotation, shift, scale)
+    state = (rotation, shift, scale.copy())
     # Seven rounds with few points sort the starts; only the best ones are refined, with more points and a tighter
     # cap.
     for _ in range(7):
         state, apart = _round(points[few], normals[few], tree, facing, state, 0.25 * width)
     apart = np.where(unrotated, CLEARLY * apart, apart)
     order = np.argsort(apart)[:CONTINUED]
-    state, unrotated = (state[0][order], state[1][order], state[2][order]), unrotated[order]
+    state, unrotated, begun = (state[0][order], state[1][order], state[2][order]), unrotated[order], scale[order]
     for _ in range(25):
         state, apart = _round(points[many], normals[many], tree, facing, state, 0.15 * width)
     apart = np.where(unrotated, CLEARLY * apart, apart)
     candidates: list[tuple[float, Similarity]] = []
     for k in np.argsort(apart):
+        if not state[2][k] > COLLAPSED * begun[k]:
+            continue
         similar = Similarity(state[0][k], state[1][k], float(state[2][k]))
         laid = similar.apply(points[many])
         # Several starts end in one place.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,12 +101,12 @@ def retarget(
     if landmarks_path is not None:
         templates = known_topology(animation.template), known_topology(mesh.vertices)
         landmarks = read_landmarks(landmarks_path, *templates, (len(animation.template), len(mesh.vertices)))
-    face_triangles = named_triangles(mesh_path, parts) if parts else None
 
-    def attempt(marks: Landmarks | None) -> tuple[Animation, Correspondence]:
+    def attempt(marks: Landmarks | None, parts: Sequence[str] = parts) -> tuple[Animation, Correspondence]:
+        some = named_triangles(mesh_path, parts) if parts else None
         with located(mesh_path):
             correspondence = correspond(
-                animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, face_triangles=face_triangles
+                animation.template, triangles, mesh.vertices, mesh.faces, landmarks=marks, face_triangles=some
             )
         return checked_transfer(correspondence)
 
@@ -119,10 +120,14 @@ def retarget(
             if common is None or check is None:
                 raise
             carried, correspondence = attempt(common)
-    except FaceDiffError as error:
-        names = [] if parts else parts_with_a_face(animation, mesh_path, mesh)
-        hint = f". A face was found in these of its parts: {', '.join(names)}; try {{part}} {names[0]}" if names else ""
-        raise error.followed_by(hint) from error
+    except FaceDiffError:
+        # A part by itself comes last: what is worn on the skin, such as brows, is found in the whole.
+        for name in [] if parts else parts_with_a_face(animation, mesh_path, mesh):
+            with suppress(FaceDiffError):
+                carried, correspondence = attempt(landmarks, [name])
+                break
+        else:
+            raise
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)
     return carried, correspondence
@@ -336,6 +341,8 @@ def transfer_displacements(correspondence: Correspondence, displacements: npt.ND
             roots = correspondence.follower_corners[hangs], correspondence.follower_weights[hangs]
             laid = carried @ np.linalg.inv(matrix).T
             carried[:, lashes] += swing(lids, correspondence.laid.vertices, lashes, *roots, laid) @ matrix.T
+    if lids is not None and all(eye.target is None for eye in lids):
+        carried[:, correspondence.beside_lids] = 0.0
     return carried
 
 

@@ -11,7 +11,7 @@ import trimesh
 
 from facediff.animation import Animation
 from facediff.editing import face_features
-from facediff.editing.correspondence import Correspondence, correspond
+from facediff.editing.correspondence import LIDS_AT_REST, Correspondence, correspond
 from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
 from facediff.editing.fit_check import check_fit
 from facediff.editing.retargeting import transfer, transfer_checked
@@ -33,7 +33,7 @@ def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence
 
 
 QUICK = ("slit mask",)
-EYES_REST = ("mask", "scan", "painted eyes", "decimated head", "few triangles")
+EYES_REST = ("mask", "scan", "painted eyes", "few triangles")
 """Heads whose eyes are one skin, or whose lids have too few triangles to meet without a hole."""
 RAGGED = ("re-meshed head",)
 """Heads in whose lips no line is found: refused, as the manual says."""
@@ -91,6 +91,21 @@ def test_a_nod_needs_no_place_on_the_mesh(animation: Animation) -> None:
     assert (same.good, same.faults) == (True, ())
     assert np.allclose(made.vertices, transfer(nodding, found, mesh).vertices)
     assert np.ptp(made.vertices[1] - made.template, axis=0)[2] > 0.02 * found.similarity.scale
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dressed avatar", "sockets and lashes"])
+def test_lashes_rest_with_their_lids(animation: Animation, name: str) -> None:
+    head = FAMILY[name]()
+    _, found = carried(animation, head)
+    rests = replace(found, lids=LIDS_AT_REST)
+    made = transfer(animation, rests, Mesh(head.vertices, head.faces.astype(np.int32)))
+    most = np.linalg.norm(made.vertices - made.template, axis=2).max(axis=0)
+    lashes = np.unique(np.concatenate([head.faces[faces] for part, faces in head.parts.items() if "lash" in part]))
+    assert len(lashes)
+    assert most[lashes].max() == 0.0
+    brows = [head.faces[faces] for part, faces in head.parts.items() if "brow" in part]
+    assert all(most[part].max() > 0 for part in brows)
 
 
 @pytest.mark.slow

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from facediff.animation import Animation, read_archive, write_archive
 from facediff.cli.app import main
-from facediff.editing.correspondence import correspond
+from facediff.editing.correspondence import Correspondence, correspond
 from facediff.editing.detached_parts import detached_parts
 from facediff.editing.face_features import find_features
+from facediff.editing.fit_check import FitReport
 from facediff.editing.retargeting import parts_with_a_face, retarget, transfer
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError, OptionError
@@ -64,8 +65,8 @@ def test_names_of_an_obj(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_parts_with_a_face_are_named(animation: Animation, tmp_path: Path) -> None:
-    """A ball, and a face that lies behind a plate in which no mouth can be seen: a refusal names the face."""
+def test_a_part_with_a_face_is_tried_by_itself(animation: Animation, tmp_path: Path) -> None:
+    """A ball, and a face beside it: where the whole is refused, the part is taken by itself."""
     ball = trimesh.creation.icosphere(3, 0.08)
     text = []
     for name, points, faces, first in (
@@ -78,13 +79,16 @@ def test_parts_with_a_face_are_named(animation: Animation, tmp_path: Path) -> No
     mesh = read_mesh(tmp_path / "two.obj")
     assert parts_with_a_face(animation, tmp_path / "two.obj", mesh) == ["Face"]
 
-    def refuse(*_: object) -> None:
-        raise OptionError.naming("two.obj: is poor; see {pick}")
+    tried = []
 
-    with pytest.raises(OptionError) as caught:
-        retarget(animation, tmp_path / "two.obj", check=refuse)
-    assert "--part Face" in caught.value.on_command_line
-    assert "--pick" in caught.value.on_command_line
+    def refuse_the_whole(_: Animation, found: Correspondence, __: FitReport) -> None:
+        tried.append(len(found.hidden))
+        if not len(found.hidden):
+            raise OptionError.naming("two.obj: is poor; see {pick}")
+
+    _, found = retarget(animation, tmp_path / "two.obj", check=refuse_the_whole)
+    assert tried == [0, len(ball.faces)]
+    assert len(found.hidden) == len(ball.faces)
 
 
 def test_names_of_a_glb_are_those_of_nodes_meshes_and_materials(tmp_path: Path) -> None:
