@@ -10,11 +10,18 @@ import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.cli.options import Corpus, File, FileOrList, FrameRate, OutputFolder, Scheduler, Size, Workers
+from facediff.cli.options import (
+    Corpus,
+    File,
+    FileOrList,
+    FrameRate,
+    OutputFolder,
+    Size,
+    WorkOptions,
+)
 from facediff.cli.parsing import Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.data import prepare as prepare_package
@@ -40,21 +47,6 @@ NewFolder = Annotated[Path, Option(writes="folder")]
 
 LISTED = 20
 """Lines of a list on the screen; the whole list is in the manifest."""
-
-
-@dataclass(frozen=True)
-class WorkOptions:
-    """Where the work is done.
-
-    Attributes:
-        workers: clips at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
-        quiet: no progress bars
-    """
-
-    workers: Workers = None
-    scheduler: Scheduler = None
-    quiet: bool = False
 
 
 def find_own_module(corpus: str | None) -> None:

@@ -11,10 +11,9 @@ from facediff.cli.options import (
     File,
     FileOrList,
     Folder,
-    Scheduler,
     Seed,
     Text,
-    Workers,
+    WorkOptions,
     named_folders,
 )
 from facediff.cli.process import confirm_cost, tell
@@ -106,10 +105,8 @@ def evaluate(
     method: Annotated[list[str] | None, Option(metavar="NAME=FOLDER", reads=True)] = None,
     json: Annotated[str | None, Option(metavar="FILE", writes="file", dash=True)] = None,
     csv: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    quiet: bool = False,
     yes: bool = False,
+    work: WorkOptions,
     scores: ScoreOptions,
     files: MotionOptions,
 ) -> None:
@@ -126,10 +123,8 @@ def evaluate(
         method: a further method, compared with the first; repeatable
         json: write everything as JSON; - prints it instead of the table
         csv: write one row for each sequence and method
-        workers: clips scored at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
-        quiet: no progress bar
         yes: start without a question, however long it takes
+        work: where the work is done
         scores: which scores are computed.
         files: how motion is stored.
     """
@@ -168,9 +163,9 @@ def evaluate(
         bootstrap=scores.bootstrap,
         level=scores.level,
         seed=scores.seed,
-        workers=workers,
-        scheduler=scheduler,
-        progress=not quiet,
+        workers=work.workers,
+        scheduler=work.scheduler,
+        progress=not work.quiet,
         **faces_of(truth, corpus, parameters, scores, files),
     )
     write(report, json, csv)
@@ -221,13 +216,10 @@ def faces_of(
 def write(report: EvaluationReport, json: str | None, csv: Path | None) -> None:
     """Print the table or the JSON, and write the files."""
     from facediff.evaluation import text
-    from facediff.utils.files import atomic
-    from facediff.utils.plain_files import json_text, write_rows
+    from facediff.utils.plain_files import json_text, write_json, write_rows
 
-    everything = json_text(f"--json {json}", report.as_dict(), indent=2, ensure_ascii=True)
-    if json is not None and json != "-":
-        with atomic(Path(json)) as temporary:
-            temporary.write_text(everything + "\n", encoding="utf-8")
+    if json not in (None, "-"):
+        write_json(Path(str(json)), report.as_dict())
     if csv is not None:
         # Each row also says over which regions its numbers were taken.
         facts = {
@@ -236,4 +228,5 @@ def write(report: EvaluationReport, json: str | None, csv: Path | None) -> None:
             for key in ("name", "count", "hash")
         }
         write_rows(csv, [row | facts for row in report.rows()])
-    tell(*(everything if json == "-" else text(report)).split("\n"))
+    printed = json_text("--json -", report.as_dict(), ensure_ascii=True) if json == "-" else text(report)
+    tell(*printed.split("\n"))

@@ -52,6 +52,21 @@ Truth = Annotated[Path, Option(metavar="TRUTH", reads=True, check=require_truth)
 
 
 @dataclass(frozen=True)
+class WorkOptions:
+    """Where the work is done.
+
+    Attributes:
+        workers: clips or videos at a time (default: as many as processors)
+        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        quiet: no progress bars
+    """
+
+    workers: Workers = None
+    scheduler: Scheduler = None
+    quiet: bool = False
+
+
+@dataclass(frozen=True)
 class PageServer:
     """Page (of a command that serves one).
 

@@ -11,10 +11,9 @@ from facediff.cli.options import (
     FrameRate,
     OutputFolder,
     PageServer,
-    Scheduler,
     Seed,
     Truth,
-    Workers,
+    WorkOptions,
     named_folders,
 )
 from facediff.cli.process import confirm_cost, tell
@@ -35,10 +34,8 @@ def make(
     mesh: File = None,
     frame_rate: FrameRate = None,
     unit: Annotated[str | None, Option(metavar="U")] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    quiet: bool = False,
     yes: bool = False,
+    work: WorkOptions,
     options: StudyOptions,
 ) -> None:
     """Make a user study from folders of animations: videos side by side, and a page that asks raters about them.
@@ -59,10 +56,8 @@ def make(
         mesh: triangles of .npy files: .ply, .obj … (default: the corpus's)
         frame_rate: frames a second of .npy files (default: the corpus's)
         unit: unit of length of .npy files (default: the corpus's)
-        workers: videos drawn at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
-        quiet: no progress bar
         yes: start without a question, however long it takes
+        work: where the work is done
         options: clips, design and questions.
     """
     folders = named_folders(methods)
@@ -82,7 +77,7 @@ def make(
     for note in plan.notes:
         tell(f"note: {note}")
     confirm_cost(yes, "--max-clips or --size", seconds=plan.seconds / 2)
-    redrawn = plan.make(output, workers=workers, scheduler=scheduler, progress=not quiet)
+    redrawn = plan.make(output, workers=work.workers, scheduler=work.scheduler, progress=not work.quiet)
     study = plan.study
     trials = study.trials_of(0)
     controls = sum(trial.kind != "pair" for trial in trials)
@@ -170,8 +165,8 @@ def report(
         raise FaceDiffError("studies: missing; give the folder of a study, or --plan D")
     from facediff.study.analysis import analyse_folder
     from facediff.study.definition import read_study
-    from facediff.study.report_files import json_report, text, write_report
-    from facediff.utils.files import atomic
+    from facediff.study.report_files import text, write_report
+    from facediff.utils.plain_files import json_text, write_json
 
     options = {"interval": interval, "level": level, "resamples": bootstrap, "seed": seed}
     ids = [read_study(folder).id for folder in folders.values()]
@@ -179,12 +174,12 @@ def report(
         analyse_folder(folder, answers or (), name=name, ignored=ids[:i] + ids[i + 1 :], **options)
         for i, (name, folder) in enumerate(folders.items())
     ]
-    if json is not None and json != "-":
-        with atomic(Path(json)) as temporary:
-            temporary.write_text(json_report(reports) + "\n", encoding="utf-8")
+    everything = {"studies": [analysis.as_dict() for analysis in reports]}
     if json == "-":
-        tell(*json_report(reports).split("\n"))
+        tell(*json_text("--json -", everything, ensure_ascii=True).split("\n"))
     else:
+        if json is not None:
+            write_json(Path(json), everything)
         for analysis in reports:
             tell(*text(analysis).split("\n"), "")
     if output is not None:

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from facediff.cli.data import WorkOptions, resumable
-from facediff.cli.options import CheckpointFile, OutputFolder
+from facediff.cli.data import resumable
+from facediff.cli.options import CheckpointFile, OutputFolder, WorkOptions
 from facediff.cli.process import tell
 from facediff.data.track.options import TrackingOptions
 from facediff.errors import FaceDiffError

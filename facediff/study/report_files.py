@@ -6,7 +6,6 @@ each data set, of which each is a study of its own.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -290,8 +289,3 @@ def comments(reports: Sequence[StudyReport]) -> list[dict[str, Any]]:
         for rater in report.raters
         for question, text in rater.comments.items()
     ]
-
-
-def json_report(reports: Sequence[StudyReport]) -> str:
-    """Everything as JSON."""
-    return json.dumps({"studies": [report.as_dict() for report in reports]}, indent=2, ensure_ascii=True)
