@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Unpack, cast
 from facediff.animation import Animation
 from facediff.animation.archives import AnimationFacts, complete, facts_of, read_animation
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
-from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
+from facediff.errors import FaceDiffError, OptionError, check_known, note, refuse_idle
 from facediff.utils import ranges
 from facediff.utils.hub import bundled_by_name, is_graphs
 from facediff.utils.paths import from_home
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 INLINE_MB = 8.0
 """The largest page that a notebook shows; of a larger one, it shows the beginning. A notebook keeps its pages."""
+DIFFERS = 0.2
+"""Seconds by which a motion and its speech may differ without a note."""
 TRIED_FRAMES = 64
 """Frames by which the size of a page is estimated."""
 INLINE_HEIGHT = 540
@@ -360,6 +362,10 @@ class SourceReader:
             contradicts = not bare and getattr(self.options, option) not in (None, value)
             refuse_idle(f"is for a bare .npy, and {path.name} has {value} by itself", **{option: contradicts})
         animation.refuse_not_finite()
+        if self.options.speech is not None and animation.speech is not None:
+            lasts = len(animation.speech) / animation.sample_rate
+            if abs(lasts - animation.seconds) > DIFFERS:
+                note(f"{path}: its motion lasts {animation.seconds:.2f} s and {self.options.speech} {lasts:.2f} s")
         return animation
 
 

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import html
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 import trimesh
 
 import facediff
 from facediff.cli.app import main
 from facediff.editing import retargeting
 from facediff.editing.blendshapes import write_live_link
+from facediff.errors import Note
 from facediff.metrics import Region
 from facediff.pipelines import motion
 from tests.fakes.clicks import FRAMES, clicks
@@ -234,3 +237,13 @@ def test_a_poor_fit_is_refused_as_by_the_command(
         anim.retarget("face.ply")
     anim.retarget("face.ply", correspondence="map.npz", accept_poor=True)
     assert len(anim.retarget("face.ply", correspondence="map.npz").vertices), "accepted when it was made"
+
+
+@pytest.mark.parametrize("seconds", [0.5, 1.0, 3.0])
+def test_speech_of_another_length_is_told(seconds: float, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((25, 4, 3), np.float32))
+    soundfile.write(tmp_path / "a.wav", np.full(round(16_000 * seconds), 0.1), 16_000)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    like = facediff.Animation("like", np.zeros((1, 4, 3), np.float32), np.zeros((4, 3), np.float32), 25.0, faces=faces)
+    with pytest.warns(Note, match="lasts 1.00 s and") if seconds != 1 else nullcontext():
+        facediff.read(tmp_path / "a.npy", like=like, speech=tmp_path / "a.wav")
