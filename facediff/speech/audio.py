@@ -130,7 +130,18 @@ def _read(source: Path | IO[bytes], name: str, max_seconds: float | None) -> tup
         if not readable:
             return _decode_container(stream, name, max_seconds, refusal)
         with open_sound(stream, name) as sound:
-            return _decoded(sound, name, max_seconds)
+            form = str(sound.format)
+            try:
+                return _decoded(sound, name, max_seconds)
+            except LostSamplesError as error:
+                refusal = error
+        if form != "OGG":
+            raise refusal
+        return _decode_container(stream, name, max_seconds, refusal)  # times of packets tell where it has holes
+
+
+class LostSamplesError(FaceDiffError):
+    """A file has fewer samples than it declares."""
 
 
 @contextmanager
@@ -291,7 +302,7 @@ def _decoded(file: Any, name: str, limit: float | None) -> tuple[Samples, int]: 
             _check_length(name, decoded / rate, limit)
             yield block
         if counted_frames and decoded < declared and not estimated:
-            raise FaceDiffError(
+            raise LostSamplesError(
                 f"{name}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
             )
 

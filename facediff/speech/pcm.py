@@ -14,7 +14,19 @@ from facediff.errors import FaceDiffError
 CHUNK = 0.02
 """Seconds of speech that are read at a time, at most."""
 
-SOUND_FILES = (b"RIFF", b"fLaC", b"OggS")
+SOUND_FILES = (
+    b"RIFF",
+    b"RIFX",
+    b"RF64",
+    b"fLaC",
+    b"OggS",
+    b"FORM",
+    b"caff",
+    b"ID3",
+    b"FLV\1",
+    b"\x1a\x45\xdf\xa3",
+    b"#!AMR",
+)
 """Beginnings of sound files, which are no samples."""
 
 
@@ -29,7 +41,7 @@ def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.rea
     rest, first = b"", True
     # A read of a pipe gives the bytes that are there, at least one, and nothing at its end.
     while data := read(source.fileno(), max(2, round(CHUNK * rate) * 2)):
-        if first and data[:4] in SOUND_FILES:
+        if first and (data.startswith(SOUND_FILES) or data[4:8] in (b"ftyp", b"moov", b"mdat")):
             raise FaceDiffError(
                 "standard input holds a sound file, not samples; give the file by its name, or only its samples "
                 "(ffmpeg -i FILE -f s16le -ac 1 -ar 16000 -)"

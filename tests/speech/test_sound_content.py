@@ -16,6 +16,7 @@ import soundfile
 
 from facediff.errors import FaceDiffError, Note
 from facediff.speech.audio import read_recording, read_speech, read_stretch, speech_of, stream_piece
+from facediff.speech.pcm import pcm
 
 RATE = 16_000
 SAMPLES = npt.NDArray[np.floating]
@@ -33,7 +34,7 @@ def container(
     pictures: int = 0,
     jumps: Sequence[tuple[float, float]] = (),
 ) -> bytes:
-    """A file of sound tracks (S,); packets from each time on are shifted by seconds, and lost if by infinity."""
+    """A file of sound tracks (S,); packets from each time on are shifted by seconds, or lost (infinity)."""
     av = pytest.importorskip("av")
     file = io.BytesIO()
     with av.open(file, "w", format=form) as out:
@@ -53,7 +54,8 @@ def container(
             parts = av.AudioResampler(context.format, "mono", rate, context.frame_size or 800)
             packets = [p for s in (sound, None) for part in parts.resample(s) for p in stream.encode(part)]
             for packet in [*packets, *stream.encode(None)]:
-                shift = sum(by for at, by in jumps if float(packet.pts * packet.time_base) >= at - 1e-6)
+                passed = [by for at, by in jumps if float(packet.pts * packet.time_base) >= at - 1e-6]
+                shift = 0.0 if passed[-1:] == [-np.inf] else sum(passed)
                 if np.isfinite(shift):
                     packet.pts = packet.dts = packet.pts + round(shift / float(packet.time_base))
                     muxed.append(packet)
@@ -150,6 +152,18 @@ def test_sound_stays_where_its_times_have_it(form: str, pictures: int, tmp_path:
         read((1.0, 7200.0))
 
 
+def test_a_hole_in_an_ogg_is_silence(tmp_path: Path) -> None:
+    path = tmp_path / "a.ogg"
+    path.write_bytes(container("ogg", [VOICE], "libopus"))
+    whole = read_speech(path)
+    path.write_bytes(container("ogg", [VOICE], "libopus", jumps=[(1.0, np.inf), (1.5, -np.inf)]))
+    with pytest.warns(Note, match="missing by its times"):
+        hole = read_speech(path)
+    expected = whole.copy()
+    expected[RATE : round(1.5 * RATE)] = 0
+    assert like(hole, expected) > 0.9
+
+
 def test_times_that_go_back(tmp_path: Path) -> None:
     path = tmp_path / "a.flv"
     flv = container("flv", [VOICE], "aac")
@@ -239,3 +253,16 @@ def test_sound_that_is_a_little_too_loud_is_divided_by_its_peak() -> None:
     with pytest.warns(Note, match="reach 1.8"):
         found = speech_of(VOICE * 6, RATE)
     np.testing.assert_allclose(found.sound, VOICE / 0.3, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["webm", "mp4", "flv", "ogg", "wav", "caf", "aiff", "rf64"])
+def test_a_file_in_place_of_samples_is_named(form: str) -> None:
+    if form == "rf64":
+        content = wav(VOICE, form="RF64")
+    else:
+        codec = {"webm": "libopus", "ogg": "libopus", "mp4": "aac", "flv": "aac", "aiff": "pcm_s16be"}.get(form, "")
+        content = container(form, [VOICE], codec)
+    source = io.BytesIO(content)
+    source.fileno = lambda: 0  # type: ignore[method-assign]
+    with pytest.raises(FaceDiffError, match="holds a sound file"):
+        list(pcm(source, RATE, lambda _, size: source.read(size)))
