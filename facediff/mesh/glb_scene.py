@@ -16,6 +16,7 @@ import numpy.typing as npt
 from facediff.mesh.glb import Glb, attributes, whole_number
 from facediff.mesh.mesh import Array, Mesh
 from facediff.utils.colours import to_srgb
+from facediff.utils.limits import COORDINATE, in_range
 
 ALIKE = 1e-5
 """Matrices of a skin that differ by less than this share are one: it is in the pose that it was bound in."""
@@ -219,7 +220,10 @@ def node_matrix(node: dict[str, Any]) -> Array | None:
         return None
 
     def given(key: str, default: list[float]) -> Array:
-        return np.array(node.get(key, default), np.float64).reshape(len(default))
+        values = np.array(node.get(key, default), np.float64).reshape(len(default))
+        if not in_range(values):
+            raise ValueError(f"the {key} of a node is not finite, or beyond {COORDINATE:g}")
+        return values
 
     matrix = given("matrix", np.eye(4).ravel().tolist()).reshape(4, 4).T.copy()
     rotation = given("rotation", [0, 0, 0, 1])

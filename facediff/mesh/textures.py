@@ -20,6 +20,7 @@ from facediff.mesh.glb import Glb, attributes, open_glb, whole_number
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
 from facediff.utils.files import holds_glb
+from facediff.utils.limits import in_range
 
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
 """How pictures begin that programs for glTF and USD read, their type and suffix."""
@@ -126,7 +127,7 @@ def _read_obj(path: Path) -> Textures | None:
     if not uvs:
         return None
     table, coordinates = np.array(corners, np.int64), np.array(uvs, np.float64)
-    if not len(table) or table.max() >= len(uvs) or table.min() < -1 or not np.isfinite(coordinates).all():
+    if not len(table) or table.max() >= len(uvs) or table.min() < -1 or not in_range(coordinates):
         raise ValueError("a face names a texture coordinate that does not exist")
     if (table < 0).any():  # corners without a coordinate get one of their own
         table[table < 0] = len(coordinates)

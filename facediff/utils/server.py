@@ -6,6 +6,7 @@ For the user study and for picking landmarks; both are ASGI applications of Star
 from __future__ import annotations
 
 import importlib
+import re
 import socket
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
@@ -51,6 +52,9 @@ def names_of(host: str) -> tuple[str, ...] | None:
     return tuple(dict.fromkeys((*LOOPBACK, host)))
 
 
+_HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[\w.-]+)(:\d{1,5})?")
+
+
 def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, public_name: str | None = None) -> bool:
     """Whether a request is for a server under one of its own names, and no page from elsewhere sends it.
 
@@ -68,6 +72,8 @@ def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, pu
         (True, False)
     """
     names = {name.lower() for name in (*(hosts or LOOPBACK), *([public_name] if public_name else []))}
+    if host and not _HOST.fullmatch(host):  # libraries take other parts of a:1.b and a\@b for the name
+        return False
     try:
         name, page = urlsplit(f"//{host}").hostname or "", urlsplit(origin or "")
         public = public_name is not None and page.scheme in ("http", "https") and page.hostname == public_name.lower()

@@ -109,6 +109,8 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     "glb of data in a name": (".glb", changed("buffers.0", {"byteLength": 56, "uri": "data:;base64,AAAA"})),
     "glb compressed": (".glb", changed("extensionsRequired", ["KHR_draco_mesh_compression"])),
     "glb of a cycle": (".glb", changed("nodes.0", {"mesh": 0, "children": [0]})),
+    "glb turned by a huge rotation": (".glb", changed("nodes.0", {"mesh": 0, "rotation": [1e300, 0, 0, 1]})),
+    "glb moved beyond all numbers": (".glb", changed("nodes.0", {"mesh": 0, "translation": [1e300, 0, 0]})),
     "glb of a huge scale": (".glb", changed("nodes.0", {"mesh": 0, "scale": [1e300, 1, 1]})),
     "glb with vertex 9": (".glb", glb(GOOD, DATA.replace(bytes([0, 2, 3, 0, 0]), bytes([0, 2, 9, 0, 0])))),
     "glb whose chunk is longer": (".glb", glb(GOOD)[:-8]),
@@ -233,6 +235,13 @@ def test_nodes_place_the_meshes_of_a_glb(node: dict[str, Any], expected: list[fl
 def test_a_mirrored_mesh_keeps_its_outside(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(changed("nodes", [{"mesh": 0, "scale": [-1, 1, 1]}]))
     assert read_mesh(tmp_path / "a.glb").faces.tolist() == [[2, 1, 0], [3, 2, 0]]
+
+
+@pytest.mark.parametrize("number", ["1e308", "-1e20", "nan", "inf"])
+def test_texture_coordinates_beyond_all_numbers_are_refused(number: str, tmp_path: Path) -> None:
+    (tmp_path / "face.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 {number}\nf 1/1 2/1 3/1\n")
+    with pytest.raises(FaceDiffError, match=r"face\.obj"):
+        read_textures(tmp_path / "face.obj", 1)
 
 
 def test_materials_that_share_a_picture_share_its_bytes(tmp_path: Path) -> None:
