@@ -161,7 +161,7 @@ def test_bad_options(
         ("--style far.npy", "it is not A's"),
         ("--style A_e99", "no clip of that name"),
         ("--sampler dim", 'there is no sampler "dim": did you mean "ddim"?'),
-        ("-o x.avi", 'there is no format ".gif"'),
+        ("-o x.avi", 'there is no format ".avi"'),
         ("--window 0.1", "too few frames"),
         ("--expressiveness chin=2", "chin"),
         ("--blinks", "--blinks: lids and eyeballs of this face are not known"),

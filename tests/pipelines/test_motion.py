@@ -130,7 +130,7 @@ def test_options_of_a_file_are_those_of_the_command(anim: facediff.Animation, tm
         (".mp4", {"tolerance": 1}, "tolerance"),
         (".npy", {"shapes": "shapes"}, "shapes"),
         (".mp4", {"size": 3}, "size 3"),
-        (".gif", {}, ".gif"),
+        (".avi", {}, ".avi"),
         (".csv", {}, "shapes"),
         (".glb", {"output_unit": "cm"}, "unit"),
     ):
