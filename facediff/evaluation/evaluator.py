@@ -42,7 +42,7 @@ from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import SAMPLE_RATE, read_speech
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges
-from facediff.utils.paths import existing, name_of_file
+from facediff.utils.paths import existing, from_home, name_of_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +150,8 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
         truth: folder of truths.
         options: the fields of :class:`EvaluationOptions`, of which ``lips`` and ``n_vertices`` are needed.
     """
-    scoring = EvaluationOptions(**options)
+    scoring, truth = EvaluationOptions(**options), from_home(truth)
+    methods = {name: from_home(folder) for name, folder in methods.items()}
     protocols = find_protocols(scoring.protocols, scoring.topology)
     sampling = Bootstrap(scoring.bootstrap, scoring.level, scoring.seed)
     source = source_unit(protocols, scoring)

@@ -29,7 +29,7 @@ ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then eve
 def cache_dir() -> Path:
     """Where data is kept that can be computed again: ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     folder = os.environ.get("FACEDIFF_CACHE")
-    return Path(folder) if folder else Path.home() / ".cache" / "facediff"
+    return Path(folder).expanduser() if folder else Path.home() / ".cache" / "facediff"
 
 
 def config_dir() -> Path:
