@@ -215,7 +215,7 @@ def mono(
         nonlocal energy, spent, lost
         if block.shape[1] == 1:
             return block[:, 0]
-        mixed = block.mean(axis=1)
+        mixed: npt.NDArray[np.floating] = block.mean(axis=1)
         starts = np.arange(0, len(block), STEP)
         each = np.add.reduceat(np.square(block, dtype=np.float64), starts, axis=0)
         together = np.add.reduceat(np.square(mixed, dtype=np.float64), starts) * block.shape[1] ** 2
