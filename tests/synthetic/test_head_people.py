@@ -52,6 +52,10 @@ def test_complexions_colour_what_they_name() -> None:
     assert tones == sorted(tones, reverse=True)
     for name, colour in HAIR_COLOURS.items():
         assert np.allclose(coloured(mesh, Complexion(hair=name))[hair].mean(axis=0), colour, atol=25), name
+    eye = mesh.both("ball_3", "iris_")
+    above = mesh.vertices[eye, 1] > EYE_CENTRE[1] + 2.0
+    light = coloured(mesh, Complexion())[eye].sum(axis=1)
+    assert light[above].mean() < 0.8 * light[~above].mean()  # the upper lid shades it
     for style in ("short", "cropped", "bald", "bob", "long", "bun"):
         points = dressed(Face(), mesh, Complexion(style=style))  # type: ignore[arg-type]
         moved = np.flatnonzero(np.abs(points - mesh.vertices).max(axis=1) > 1e-9)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facediff.synthetic.geometry import Array, bump, rise
-from facediff.synthetic.head.hair import HairStyle, density, hair_points
+from facediff.synthetic.head.hair import HAIR_COLUMNS, HAIR_ROWS, HairStyle, density, hair_points
 from facediff.synthetic.head.layout import MOUTH_Y
 from facediff.synthetic.head.mesh import QuadMesh
 from facediff.synthetic.head.parts import BROW_COLUMNS, EYE_CENTRE, HAIR, SHIRT, SKIN
@@ -42,6 +42,10 @@ SHIRTS = {
     "wine": (110, 46, 58),
     "moss": (96, 110, 74),
 }
+STRANDS, MOTTLED = 0.14, 0.008
+"""Spread of the brightness of strands, and of the colour of places of skin."""
+LID_SHADOW = 0.55
+"""Share of the light that is left below the upper lid."""
 EYE_COLOURS = {"blue": (96, 128, 150), "grey": (120, 130, 132), "green": (98, 122, 84), "brown": (98, 66, 42)}
 
 
@@ -210,8 +214,16 @@ def coloured(mesh: QuadMesh, complexion: Complexion) -> NDArray[np.uint8]:
         colours[skin] += shadow * (0.55 * tone + [8.0, 10.0, 12.0] - colours[skin])
     colours[mesh.both("lip_outer", "lip_crest", "lip_front", "lip_inner")] *= 0.45 + 0.55 * tint
     grid, share = mesh.groups["hair"], density(complexion.style)[:, None]
-    strand = share * hair_tint * colours[grid] + (1.0 - share) * 0.9 * tone
-    colours[grid] = colours[mesh.mirror[grid]] = strand
+    # Strands differ from one another, and no two sides of a head are alike; neither are two places of skin.
+    random = np.random.default_rng(0)
+    for side in (grid, mesh.mirror[grid]):
+        own = np.tile(random.normal(1.0, STRANDS, HAIR_COLUMNS), HAIR_ROWS) * random.normal(1.0, 0.04, len(grid))
+        colours[side] = (
+            share * (own / own.mean())[:, None] * hair_tint * mesh.colours[grid] + (1.0 - share) * 0.9 * tone
+        )
+    mottled = mesh.both("skin", "mouth_far", "mouth_near", "ear_")
+    colours[mottled] *= random.normal(1.0, MOTTLED, len(mottled))[:, None]
+    colours[mottled, 1:] *= random.normal(1.0, MOTTLED, len(mottled))[:, None]
     colours[mesh.both("hair_crown")] *= hair_tint
     brow = np.array(HAIR) * (0.25 + 0.6 * np.minimum(hair_tint, 2.2))
     for name, peak in (("brow_0", 0.35), ("brow_1", 0.95), ("brow_2", 0.9), ("brow_3", 0.3)):
@@ -224,4 +236,8 @@ def coloured(mesh: QuadMesh, complexion: Complexion) -> NDArray[np.uint8]:
     for name in ("iris_rim", "iris_middle", "iris_inner"):
         average = mesh.colours[mesh.groups["iris_middle"]].mean(axis=0)
         colours[mesh.both(name)] *= iris / average
+    # The upper lid shades the eye, and light gathers in the lower half of the iris.
+    for name, below in (("ball_", 1.0), ("iris_", 1.3)):
+        eye = mesh.both(name)
+        colours[eye] *= (below + (LID_SHADOW - below) * rise(mesh.vertices[eye, 1] - EYE_CENTRE[1], -4.0, 4.5))[:, None]
     return np.asarray(np.clip(np.rint(colours), 0, 255), dtype=np.uint8)
