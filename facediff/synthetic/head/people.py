@@ -216,11 +216,10 @@ def coloured(mesh: QuadMesh, complexion: Complexion) -> NDArray[np.uint8]:
     grid, share = mesh.groups["hair"], density(complexion.style)[:, None]
     # Strands differ from one another, and no two sides of a head are alike; neither are two places of skin.
     random = np.random.default_rng(0)
+    scalp = (1.0 - share) * 0.9 * tone
     for side in (grid, mesh.mirror[grid]):
-        own = np.tile(random.normal(1.0, STRANDS, HAIR_COLUMNS), HAIR_ROWS) * random.normal(1.0, 0.04, len(grid))
-        colours[side] = (
-            share * (own / own.mean())[:, None] * hair_tint * mesh.colours[grid] + (1.0 - share) * 0.9 * tone
-        )
+        light = np.tile(random.normal(1.0, STRANDS, HAIR_COLUMNS), HAIR_ROWS) * random.normal(1.0, 0.04, len(grid))
+        colours[side] = share * (light / light.mean())[:, None] * hair_tint * mesh.colours[grid] + scalp
     mottled = mesh.both("skin", "mouth_far", "mouth_near", "ear_")
     colours[mottled] *= random.normal(1.0, MOTTLED, len(mottled))[:, None]
     colours[mottled, 1:] *= random.normal(1.0, MOTTLED, len(mottled))[:, None]
