@@ -118,6 +118,7 @@ def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
 def _read(source: Path | IO[bytes], name: str, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
     """Mono samples (S,) of a file and their rate, by libsndfile or, where that knows no such content, by PyAV."""
     with _opened(source, name) as stream:
+        stream.seek(0)
         refuse_cut_short(stream, name)
         try:
             with open_sound(stream, name) as sound:
@@ -148,7 +149,7 @@ class LostSamplesError(FaceDiffError):
 def _opened(source: Path | IO[bytes], name: str) -> Iterator[IO[bytes]]:
     """A file as a stream of bytes: a library that opens it by itself would go by its name and by files beside it."""
     if not isinstance(source, Path):
-        yield source
+        yield source if getattr(source, "seekable", lambda: False)() else io.BytesIO(source.read())
         return
     if not source.is_file() or source.stat().st_size == 0:
         raise FaceDiffError(

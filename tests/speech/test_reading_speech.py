@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,6 +41,27 @@ def test_open_files_and_audio_of_data_sets_are_the_recording(recording: Path) ->
             assert (found.name, found.rate) == (name, 22050), form
             np.testing.assert_allclose(found.speech, expected.speech, rtol=0, atol=2e-7, err_msg=form)
             np.testing.assert_allclose(found.sound, 0.75 * TONE, rtol=0, atol=1 / 32768, err_msg=form)
+
+
+class Pipe(io.RawIOBase):
+    """A file that is read once from the beginning to the end, such as an answer of a server."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content = io.BytesIO(content)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:  # noqa: ANN401
+        return self.content.readinto(buffer)
+
+
+def test_a_file_that_is_read_once_is_the_recording(recording: Path) -> None:
+    expected = speech_of(recording).speech
+    np.testing.assert_array_equal(speech_of(Pipe(recording.read_bytes())).speech, expected)  # type: ignore[arg-type]
+    at_its_end = io.BytesIO()
+    at_its_end.write(recording.read_bytes())
+    np.testing.assert_array_equal(speech_of(at_its_end).speech, expected)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ Worker processes import this, so it imports nothing heavy.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from facediff.data.check.findings import Findings, relative
 from facediff.data.storage import open_motion, rig_path
 from facediff.errors import FaceDiffError
-from facediff.speech.audio import CUT, cut_short, open_sound
+from facediff.speech.audio import CUT, SAMPLE_RATE, cut_short, open_sound, read_speech
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.checksums import sha256
 
@@ -31,7 +32,6 @@ NEAR = 0.005
 NEARER = 0.5
 """Motion belongs to another subject if that subject's template is nearer than this share of the own distance."""
 
-BLOCK = 1 << 16  # samples of all channels together that are decoded at a time
 SLIGHT = 0.1  # seconds by which the lengths of speech and motion may differ without a finding
 MUCH = (0.5, 0.1)
 """Speech and motion that differ by more than so many seconds and by more than this share do not belong together."""
@@ -213,49 +213,22 @@ def _distance(frame: npt.NDArray[np.float64], template: npt.NDArray[np.float64])
 
 def _check_sound(info: ClipInfo, rules: Rules, path: Path) -> None:
     findings, where = info.findings, relative(path, rules.root)
-    before = len(findings)
-    if not path.is_file():
-        findings.error("sound_unreadable", where, "is no regular file; put the recording there")
-        return
-    try:
-        if not path.stat().st_size:
-            findings.error("sound_empty", where, "the file is empty; get the recording again")
-            return
+    with findings.guard("sound_unreadable", path, rules.root):
         if (fault := cut_short(path)) is not None:
             findings.error("sound_truncated", where, f"{CUT}: {fault}; copy it again")
             return
-        with open_sound(path) as file:
-            frames, rate, channels = file.frames, file.samplerate, file.channels
-            if not frames:
-                findings.error("sound_empty", where, "holds no samples; get the recording again")
-                return
-            if not rules.quick:
-                _decode(findings, file, where)
-    except FaceDiffError as error:
-        findings.error("sound_unreadable", where, str(error).removeprefix(f"{path}: "))
-        return
-    except Exception as error:  # the decoder raises its own errors and others on damaged files
-        message = f"not a readable sound file ({error}); expected a .wav recording, copy it again"
-        findings.error("sound_unreadable", where, message)
-        return
-    info.sample_rate, info.channels = int(rate), int(channels)
-    if len(findings) == before:
-        info.seconds = frames / rate
-
-
-def _decode(findings: Findings, file: Any, where: str) -> None:  # noqa: ANN401 - soundfile has no types
-    decoded, finite, loudest = 0, True, 0.0
-    for block in file.blocks(max(1, BLOCK // file.channels), dtype="float32", always_2d=True):
-        decoded += len(block)
-        finite = finite and bool(np.isfinite(block).all())
-        loudest = max(loudest, float(np.abs(block).max(initial=0.0)))
-    if decoded < file.frames:
-        message = f"only {decoded} of {file.frames} samples can be decoded: it is cut short or damaged; copy it again"
-        findings.error("sound_truncated", where, message)
-    elif not finite:
-        findings.error("sound_not_finite", where, "holds samples that are not finite numbers; convert it again")
-    elif loudest == 0:
-        findings.error("sound_silent", where, "is silent throughout; get the recording again or remove the clip")
+        seconds = 0.0
+        with suppress(FaceDiffError), open_sound(path) as file:  # of other containers than libsndfile's all is read
+            info.sample_rate, info.channels = int(file.samplerate), int(file.channels)
+            seconds = file.frames / file.samplerate
+        if not rules.quick or not seconds:
+            speech = read_speech(path)
+            seconds = len(speech) / SAMPLE_RATE
+            if not speech.any():
+                findings.error(
+                    "sound_silent", where, "is silent throughout; get the recording again or remove the clip"
+                )
+        info.seconds = seconds
 
 
 # Both together.

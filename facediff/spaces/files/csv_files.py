@@ -58,19 +58,13 @@ def timecode(seconds: float) -> str:
     return f"{time // 3600:02d}:{time // 60 % 60:02d}:{time % 60:02d}:{fraction // 1000:02d}.{fraction % 1000:03d}"
 
 
-def seconds_of(text: str) -> float | None:
-    """Seconds since midnight of a timecode, the inverse of :func:`timecode`; None for anything else.
+def fields_of(text: str) -> tuple[int, float] | None:
+    """Whole seconds since midnight of a timecode, and its last field; None for anything else.
 
     Example:
-        >>> seconds_of("00:00:01:30.000"), seconds_of("1:30")
-        (1.5, None)
+        >>> fields_of("00:00:01:30.000"), fields_of("1:30")
+        ((1, 30.0), None)
     """
-    fields = _fields(text)
-    return None if fields is None else fields[0] + fields[1] / SIXTIETHS
-
-
-def _fields(text: str) -> tuple[int, float] | None:
-    """Whole seconds since midnight of a timecode, and its last field; None for anything else."""
     match = _TIMECODE.fullmatch(text.strip())
     if match is None:
         return None
@@ -167,7 +161,7 @@ def read_live_link(path: Path) -> ParameterClip:
     for number, row in enumerate(rows, start=2):
         if not any(row[2:]):
             continue  # a frame in which the phone saw no face: its row has a timecode and nothing else
-        stamp = _fields(row[at_time]) if len(row) > at_time else None
+        stamp = fields_of(row[at_time]) if len(row) > at_time else None
         if stamp is None:
             raise FaceDiffError(
                 f"{path}: row {number} has the timecode {quoted(row[at_time : at_time + 1])}; expected "

@@ -96,8 +96,8 @@ ERRORS: list[tuple[str, Plant, set[str], str]] = [
     (
         "NaN in sound",
         lambda r: change_sound(sound(r), lambda s: np.where(np.arange(len(s)) == 9, np.nan, s), "FLOAT"),
-        {"sound_not_finite"},
-        "not finite",
+        {"sound_unreadable"},
+        "finite numbers",
     ),
     ("speech of another clip", lambda r: change_sound(sound(r), lambda s: s[:6000]), {"length"}, "do not belong"),
     (

@@ -14,7 +14,7 @@ from facediff.errors import FaceDiffError, Note
 from facediff.spaces import layout
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.files import ParameterClip, even, read_parameters, write_parameters
-from facediff.spaces.files.csv_files import seconds_of, timecode
+from facediff.spaces.files.csv_files import SIXTIETHS, fields_of, timecode
 from facediff.spaces.rotations import convert, matrices
 
 # The first rows of a real take have such steps: two sixtieths less a thousandth now and then.
@@ -89,10 +89,10 @@ def test_read_live_link_without_rotations_declares_them_absent(tmp_path: Path) -
 
 def test_timecodes_of_all_times() -> None:
     for seconds in np.random.default_rng(1).integers(0, 86_400 * 60_000, 200) / 60_000:
-        back = seconds_of(timecode(seconds))
+        back = fields_of(timecode(seconds))
         assert back is not None
-        assert abs(back - seconds) < 1e-9
-    assert seconds_of("00:00:61:00.0") is None
+        assert abs(back[0] + back[1] / SIXTIETHS - seconds) < 1e-9
+    assert fields_of("00:00:61:00.0") is None
 
 
 def test_read_live_link_goes_on_after_midnight(tmp_path: Path) -> None:
