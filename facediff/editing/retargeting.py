@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +43,8 @@ from facediff.spaces.space import METRES
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
+
+T = TypeVar("T")
 
 ROUNDS = 20  # How often vertices whose place is not well known are averaged with their neighbours
 CHUNK_BYTES = 32 * 2**20
@@ -111,15 +114,10 @@ def retarget(
         return checked_transfer(correspondence)
 
     try:
-        try:
-            carried, correspondence = attempt(landmarks)
-        except FaceDiffError:
-            # Named landmarks come second: a good fit needs none, and they are only known to a vertex, so that they
-            # would pull at it.
-            common = common_landmarks(animation.template, mesh.vertices) if landmarks is None else None
-            if common is None or check is None:
-                raise
-            carried, correspondence = attempt(common)
+        given = landmarks is not None or check is None
+        carried, correspondence = (
+            attempt(landmarks) if given else by_shape_or_names(attempt, animation.template, mesh.vertices)
+        )
     except FaceDiffError:
         # A part by itself comes last: what is worn on the skin, such as brows, is found in the whole.
         for name in [] if parts else parts_with_a_face(animation, mesh_path, mesh):
@@ -131,6 +129,22 @@ def retarget(
     if correspondence_path is not None:
         save_correspondence(correspondence_path, correspondence)
     return carried, correspondence
+
+
+def by_shape_or_names(
+    attempt: Callable[[Landmarks | None], T], source: npt.NDArray[np.floating], target: npt.NDArray[np.floating]
+) -> T:
+    """The result of an attempt without landmarks or, where that fails, with the named ones of both meshes (V, 3).
+
+    These come second: a good fit needs none, and they are only known to a vertex, so that they would pull at it.
+    """
+    try:
+        return attempt(None)
+    except FaceDiffError:
+        common = common_landmarks(source, target)
+        if common is None:
+            raise
+        return attempt(common)
 
 
 def has_z_up(correspondence: Correspondence) -> bool:

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.correspondence import Correspondence, correspond
-from facediff.editing.retargeting import transfer, transfer_checked
+from facediff.editing.landmarks import Landmarks
+from facediff.editing.retargeting import by_shape_or_names, transfer, transfer_checked
 from facediff.errors import FaceDiffError
 from facediff.mesh import Mesh
 from facediff.mesh.flame import Flame
@@ -183,11 +184,16 @@ class Placement:
         rig = self.face.rig
         faces = np.asarray(rig.faces, np.int64)
         target = Mesh(np.asarray(rig.neutral, np.float32), faces.astype(np.int32))
-        if self._correspondence is None:
-            fitted = correspond(animation.template, animation.triangles, target.vertices, faces)
-            carried, self._correspondence, report = transfer_checked(animation, fitted, target)
+
+        def attempt(landmarks: Landmarks | None) -> tuple[Animation, Correspondence]:
+            fitted = correspond(animation.template, animation.triangles, target.vertices, faces, landmarks=landmarks)
+            carried, correspondence, report = transfer_checked(animation, fitted, target)
             if not report.good:
                 raise FaceDiffError(f"its face could not be carried to the open one: {report.faults[0]}")
+            return carried, correspondence
+
+        if self._correspondence is None:
+            carried, self._correspondence = by_shape_or_names(attempt, animation.template, target.vertices)
         else:
             carried = transfer(animation, self._correspondence, target)
         return np.asarray(carried.vertices[:, self.face.points], np.float64)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from facediff.animation.styles import split_styles
-from facediff.errors import OptionError
+from facediff.errors import OptionError, note
 from facediff.speech.audio import SAMPLE_RATE, VIDEOS
 
 if TYPE_CHECKING:
@@ -58,7 +58,8 @@ def video_style(video: Path, model: Any) -> Path:  # noqa: ANN401 - an Animator,
     with scratch_folder(target) as scratch:
         people = scratch / "people"
         report = track_people({"style": [video]}, people, TrackingOptions(face="largest"), workers=1)
-        print(*report.warnings, sep="\n", end="\n" if report.warnings else "")
+        for text in report.warnings:
+            note(text)
         motion = first_clip(people)
         if model.n_vertices != len(motion.template):
             still = model.animate(np.zeros(SAMPLE_RATE, np.float32), SAMPLE_RATE, seed=0)

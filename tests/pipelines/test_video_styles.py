@@ -14,6 +14,7 @@ import pytest
 import facediff
 from facediff.cli.app import main
 from facediff.data.track.face import pair_distances
+from facediff.errors import Note
 from facediff.pipelines.video_styles import with_video_styles
 from facediff.speech.audio import read_speech
 from facediff.utils.files import example_recordings
@@ -31,15 +32,14 @@ def video(tmp_path: Path) -> Path:
     return write_coded_video(tmp_path / "eva.mp4", [look.picture() for look in talking(3)])
 
 
-def test_a_video_is_a_style_on_the_models_face(
-    video: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.filterwarnings("ignore::facediff.errors.Note")
+def test_a_video_is_a_style_on_the_models_face(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = cast("Callable[[], facediff.Animator]", lambda: SimpleNamespace(corpus="people", n_vertices=468))
-    words = str(with_video_styles(f"{video}:0.5,other:0.5", model))
+    with pytest.warns(Note, match="the face model has SHA-256 000"):
+        words = str(with_video_styles(f"{video}:0.5,other:0.5", model))
     file, weight = words.split(",")[0].rsplit(":", 1)
     motion = facediff.read(file)
     assert (motion.vertices.shape[1:], motion.name, weight) == ((468, 3), "style_s001", "0.5")
-    assert "warning: the face model has SHA-256 000" in capsys.readouterr().out
     monkeypatch.setattr("facediff.data.track.corpus.track_people", None)  # the second time nothing is tracked
     assert with_video_styles({str(video): 0.5, "other": 1}, model) == {file: 0.5, "other": 1}
     with pytest.raises(facediff.FaceDiffError, match=r"style maria\.mp4: no such file"):
@@ -51,6 +51,7 @@ def test_other_styles_stay(style: object) -> None:
     assert with_video_styles(style, cast("Callable[[], facediff.Animator]", None)) == style
 
 
+@pytest.mark.filterwarnings("ignore::facediff.errors.Note")
 def test_python_and_the_command_take_a_video_alike(
     video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -76,6 +76,7 @@ class PersonReport:
     def line(self) -> str:
         """The report in a line."""
         parts = ", ".join(f"{count} {split}" for split, count in self.splits.items())
+        parts = parts if self.clips > 1 else "in no split; more video gives more clips"
         return (
             f"{self.name}: {counted(self.clips, 'clip')} ({parts}), {self.seconds / 60:.1f} min; irises measure "
             f"{self.iris:.1f} mm, lips of the neutral face are {self.neutral_gap:.1f} mm apart"
@@ -93,15 +94,18 @@ class TrackingReport:
 
     @property
     def warnings(self) -> list[str]:
-        """Points for the user to look at, a line each."""
+        """Faults of the videos and the model, a sentence each."""
         version = f"the face model has SHA-256 {self.digest}; the limits of tracking were measured with {SHA256}"
         people = [f"{person.name}: {text}" for person in self.people for text in person.warnings]
-        return [f"warning: {text}" for text in [*([] if self.digest == SHA256 else [version]), *people]]
+        return [*([] if self.digest == SHA256 else [version]), *people]
 
     def lines(self) -> list[str]:
         """The report, a line each."""
-        problems = [f"not used: {problem}" for problem in self.failed.values()]
-        return [*(person.line() for person in self.people), *self.warnings, *problems]
+        return [
+            *(person.line() for person in self.people),
+            *(f"warning: {text}" for text in self.warnings),
+            *(f"not used: {problem}" for problem in self.failed.values()),
+        ]
 
 
 def find_videos(source: Path, name: str | None) -> dict[str, list[Path]]:
@@ -418,8 +422,6 @@ def warnings(recordings: Sequence[tuple[Recording, RecordingSummary]], clips: Se
     gaps = np.concatenate([clip.gaps for clip in clips])
     if np.mean(gaps > CLOSED) > OPEN:
         yield "the mouth is open in more than 90 % of the frames, and the neutral face perhaps; film closed lips too"
-    if len(clips) == 1:
-        yield "a person's only clip belongs to no split; more video gives more clips"
     ratio = float(np.median([clip.difference_ratio for clip in clips]))
     if ratio > NOISY_BROWS:
         yield f"the motion of the brows is mostly noise (difference ratio {ratio:.2f}); a larger, evenly lit face helps"

@@ -214,3 +214,20 @@ def test_pairs_that_contradict_each_other_are_refused(pairs: list[tuple[int, int
     for name in ("a.json", "a.csv"):
         with pytest.raises(FaceDiffError, match=f"pairs 1 and {len(pairs)}"):
             read_landmarks(tmp_path / name)
+
+
+def test_named_landmarks_come_second() -> None:
+    head = HEAD.vertices
+    attempts: list[Landmarks | None] = []
+
+    def attempt(landmarks: Landmarks | None) -> str:
+        attempts.append(landmarks)
+        if landmarks is None:
+            raise FaceDiffError("no line between its lips was found")
+        return "by names"
+
+    assert retargeting.by_shape_or_names(attempt, head, head) == "by names"
+    assert [marks and "chin" in marks.names for marks in attempts] == [None, True]
+    assert retargeting.by_shape_or_names(str, head, head) == "None"
+    with pytest.raises(FaceDiffError, match="no line"):
+        retargeting.by_shape_or_names(attempt, head[:-1], head)
