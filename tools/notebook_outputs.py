@@ -1,7 +1,8 @@
 """Run the notebooks of the manual with the small settings of their test, and store what they print in them.
 
-``python tools/notebook_outputs.py FOLDER`` works in an empty folder. Faces that play are stored as a line of text,
-since their pages are hundreds of kilobytes; messages of Lightning and paths of this machine are left out.
+``python tools/notebook_outputs.py FOLDER`` works in an empty folder; the notebook of a person needs the model of a face
+in ``FACEDIFF_FACE_MODEL``. Faces that play are stored as a line of text, since their pages are hundreds of kilobytes;
+messages of Lightning and paths of this machine are left out.
 """
 
 from __future__ import annotations
@@ -48,9 +49,11 @@ def main() -> None:
     """Run as a program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder.resolve()
+    parser.add_argument("names", nargs="*", help="notebooks without .ipynb; all of them if none is given")
+    options = parser.parse_args()
+    folder = options.folder.resolve()
     os.environ.update(FACEDIFF_CACHE=str(folder / "cache"), PYTHONPATH=str(ROOT), OMP_NUM_THREADS="1")
-    for path in NOTEBOOKS:
+    for path in (path for path in NOTEBOOKS if not options.names or path.stem in options.names):
         place = folder / path.stem
         place.mkdir(parents=True)
         notebook = nbformat.read(path, as_version=4)

@@ -4,6 +4,8 @@
     python tools/pictures.py                      # all of them, in about ten minutes on two cores
     python tools/pictures.py own_mesh viewer_overlay --scratch made
 
+people needs Google's model of a face ($FACEDIFF_FACE_MODEL, docs/own_data.md).
+
 Not made here: convergence.svg (docs/results/puppet_methods.md), and export_blender.png, live_path.svg and
 architecture.svg, which were drawn by hand or by programs of version 1.1.0.
 """
@@ -103,6 +105,16 @@ PICTURES: dict[str, tuple[str, ...]] = {
         "facediff retarget hello.npz --target-mesh face.obj -o mine.glb --correspondence map.npz --show {picture}",
     ),
     "own_mesh_picking.png": (BROWSER + "picking_picture.py {picture}",),
+    "people.webp": (
+        f"facediff animate {' '.join(f'{{corpus}}/wav/F1_e{number:02d}.wav' for number in range(1, 25))} --identity F1 "
+        "--sway 6 --size 384 --suffix .mp4 -o ada",
+        "facediff data track ada --name ada -o ada_corpus --preview look.mp4",
+        "facediff person ada --name ada -o ada.ckpt",
+        f"{SPEECH} --checkpoint ada.ckpt -o spoken.npz",
+        "facediff blendshapes --write-puppet-shapes m2 --identity M2",
+        "facediff retarget spoken.npz --target-mesh m2/neutral.obj -o on_face.npz",
+        "python {root}/tools/people_picture.py look.mp4 ada_corpus on_face.npz {picture}",
+    ),
     "puppet_head.webp": ("python {root}/tools/puppet_sheet.py {picture}",),
     "regions.png": ("facediff data regions {corpus} -o {picture}",),
     "study_narrow.png": (*STUDY, f"{RATING} --width 390 --height 844"),
