@@ -117,6 +117,7 @@ COMMANDS = {
     "data track": Command(
         "facediff.cli.track:track", "make a corpus of people from their videos", "prepare,render,onnx"
     ),
+    "data align": Command("facediff.cli.data:align", "find the phones of people's recordings, and cut them", "align"),
     "data import-take": Command(
         "facediff.cli.data:import_take", "make a recording of Live Link Face a corpus entry", "prepare"
     ),
@@ -133,7 +134,7 @@ GROUPS = {
     "style": "speaking styles of trained models",
     "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
     "study": "user studies: make, serve, report",
-    "data": "track faces in videos; prepare, check and pack corpora",
+    "data": "track faces in videos; align recordings; prepare, check and pack corpora",
 }
 
 

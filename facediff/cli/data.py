@@ -107,6 +107,36 @@ def check(
     return 0 if report.sound else 1
 
 
+def align(
+    recordings: Root,
+    *,
+    output: OutputFolder,
+    work: WorkOptions,
+) -> int:
+    """Write people's recordings with their phones, for the built-in corpus (--data.recordings).
+
+    Phones come from NAME.TextGrid next to NAME.wav, else from pocketsphinx: for English, of words in NAME.txt or in
+    LibriSpeech's *.trans.txt, else of words that it recognises.
+
+    Args:
+        recordings: folder with a folder of recordings for each speaker; directly in it, each recording is a speaker
+        output: folder to make or to continue
+        work: where the work is done
+
+    Returns:
+        0 if all recordings were used, 1 if some could not.
+    """
+    from facediff.data.align import align_recordings
+
+    with resumable(output):
+        report = align_recordings(
+            recordings, output, workers=work.workers, scheduler=work.scheduler, progress=not work.quiet
+        )
+    tell(*report.lines())
+    tell(f"Next: facediff fit --config configs/experiment/puppet.yaml --data.recordings={output}")
+    return 1 if report.failed else 0
+
+
 # ``facediff data prepare``: the options of a corpus are the keyword parameters of its plan.
 
 CORPORA = tuple(module.name for module in pkgutil.iter_modules(prepare_package.__path__))

@@ -116,6 +116,11 @@ class Augmenter:
         self.augmentations = list(augmentations)
         self.share = share
 
+    @property
+    def speech_only(self) -> bool:
+        """Whether all augmentations leave the motion as it is, in whatever form it comes."""
+        return all(isinstance(change, SpeechAugmentation) for change in self.augmentations)
+
     def __call__(self, example: Example, seed: int) -> Example:
         """The clip as these augmentations change it; the same seed changes it in the same way."""
         random = np.random.default_rng(seed)

@@ -495,7 +495,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             augmenter=self.augmenter if training else None,
             augmented_clips=self.augmented_clips,
             mouth=self._mouth() if training and self.augmenter is not None else None,
-            projection=self.projection if training and self.augmenter is None else ProjectionSlot(),
+            projection=self.projection
+            if training and (self.augmenter is None or self.augmenter.speech_only)
+            else ProjectionSlot(),
         )
 
     def _with_reference(self, clips: list[Clip], policy: ReferencePolicy) -> list[Clip]:

@@ -21,10 +21,10 @@ from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER, ChannelFolder, Cl
 from facediff.errors import FaceDiffError
 from facediff.spaces import Rotation, Space
 from facediff.synthetic import corpus as puppet
-from facediff.synthetic.cast import CAST, MOST_DRAWN, SEEN, UNSEEN, drawn_names
+from facediff.synthetic.cast import ALIGNED, CAST, MOST_DRAWN, SEEN, UNSEEN, drawn_names, recorded_names
 from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.known_faces import built_in_rig as built_in_rig
-from facediff.synthetic.recordings import ALIGNED, speakers_of
+from facediff.synthetic.recordings import speakers_of
 from facediff.synthetic.voices import in_language
 from facediff.utils.arrays import open_array, open_vertices
 from facediff.utils.files import cache_dir
@@ -91,7 +91,7 @@ def cache_root(seed: int = 0, drawn_speakers: int = 0, people: Sequence[str] = (
     more = f"-drawn{drawn_speakers}" if drawn_speakers else ""
     more += f"-people{len(people)}" if people else ""
     # Two folders of recordings may have equally many speakers.
-    if people and people[0].startswith(ALIGNED):
+    if recorded_names(people):
         more += "-" + hashlib.sha256("\n".join(people).encode()).hexdigest()[:8]
     return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}{more}"
 
@@ -117,8 +117,8 @@ class Puppet(SpeechMotionDataModule):
             The test splits do not change.
         people_voices: let every second drawn speaker speak with a voice made from recordings of people, as far as flite
             and Festival are installed.
-        recordings: folder of people's recordings, ``SPEAKER/NAME.wav`` or ``.flac`` with ``NAME.TextGrid``: each drawn
-            speaker speaks with the recordings of one person.
+        recordings: folder of people's recordings as `facediff data align` writes them, ``SPEAKER/NAME.wav`` or
+            ``.flac`` with ``NAME.TextGrid``: each person is a speaker more, with a drawn face and speaking style.
         motion: ``vertices``, or ``arkit`` for the truth as it is kept: ARKit's 52 shapes and two of
             the tongue, the turns of head and eyes; see docs/parameters.md.
         batch_size: clips a batch; used where no frame budget is given.
@@ -154,12 +154,11 @@ class Puppet(SpeechMotionDataModule):
         extra_identities: list[str] | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        if people_voices and recordings is not None:
-            raise FaceDiffError("data.people_voices and data.recordings both say who speaks; give one of them")
         people = puppet.people_voices() if people_voices else ()
         if recordings is not None:
-            people = tuple(f"{ALIGNED}:{speaker}" for speaker in speakers_of(Path(recordings).expanduser().absolute()))
-        invented = drawn_names(drawn_speakers)
+            speakers = speakers_of(Path(recordings).expanduser().absolute())
+            people = (*people, *(f"{ALIGNED}:{speaker}" for speaker in speakers))
+        invented = (*drawn_names(drawn_speakers), *recorded_names(people))
         super().__init__(
             root=str(cache_root(seed, drawn_speakers, people)) if root is None else root,
             batch_size=batch_size,
@@ -171,7 +170,7 @@ class Puppet(SpeechMotionDataModule):
                 f"{self.root}: holds the first edition of the built-in corpus, which 1.1 was the last to read; choose "
                 f"another folder, or remove it"
             )
-        self.seed, self.drawn, self.voices = seed, invented, people
+        self.seed, self.drawn, self.invented, self.voices = seed, drawn_speakers, invented, people
         if motion != "vertices":
             self.space = channel_space()
             self.n_vertices = len(self.space.channels)
@@ -182,8 +181,8 @@ class Puppet(SpeechMotionDataModule):
     def prepare_data(self) -> None:
         """Make the corpus if it does not exist; called on one process only."""
         if self.packed is None:
-            workers = min(4, processors()) if self.drawn else 1
-            puppet.generate(self.root, seed=self.seed, drawn=len(self.drawn), people=self.voices, workers=workers)
+            workers = min(4, processors()) if self.invented else 1
+            puppet.generate(self.root, seed=self.seed, drawn=self.drawn, people=self.voices, workers=workers)
         super().prepare_data()
 
     def channel_folder(self) -> ClipStorage:
@@ -223,7 +222,7 @@ class Puppet(SpeechMotionDataModule):
 
     def stores_reference(self, identity: str) -> bool:
         """True for the cast: drawn speakers are there to learn from, and 42 of their clips take 90 MB."""
-        return identity not in self.drawn
+        return identity not in self.invented
 
     def default_reference(self, clips: list[Clip]) -> Clip:
         """A clip in neutral mood."""

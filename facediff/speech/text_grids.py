@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
+from facediff.utils.files import atomic
 
 PHONES = ("phones", "phone", "phonemes", "phoneme", "mau", "segments", "segment")
 WORDS = ("words", "word", "ort", "ort-mau")
@@ -112,3 +113,32 @@ def _text(tokens: Iterator[re.Match[str]]) -> str:
 
 def _number(tokens: Iterator[re.Match[str]]) -> float:
     return float(next(tokens)[3])
+
+
+def write_text_grid(path: Path, tiers: Mapping[str, Sequence[Interval]], end: float) -> None:
+    """Write interval tiers in Praat's long text format; the times between intervals become empty ones.
+
+    Args:
+        path: the file.
+        tiers: intervals by name of the tier, in order of time.
+        end: in seconds.
+    """
+    lines = ['File type = "ooTextFile"', 'Object class = "TextGrid"', "", "xmin = 0", f"xmax = {end:.4f}"]
+    lines += ["tiers? <exists>", f"size = {len(tiers)}", "item []:"]
+    for number, (name, intervals) in enumerate(tiers.items(), 1):
+        filled: list[Interval] = []
+        for start, stop, text in (*intervals, (end, end, "")):
+            before = filled[-1][1] if filled else 0.0
+            filled += [(before, start, "")] if start - before > 1e-4 else []
+            filled += [(max(start, before), stop, text)] if stop - max(start, before) > 1e-4 else []
+        lines += [f"    item [{number}]:", '        class = "IntervalTier"', f'        name = "{name}"']
+        lines += ["        xmin = 0", f"        xmax = {end:.4f}", f"        intervals: size = {len(filled)}"]
+        for index, (start, stop, text) in enumerate(filled, 1):
+            lines += [
+                f"        intervals [{index}]:",
+                f"            xmin = {start:.4f}",
+                f"            xmax = {stop:.4f}",
+            ]
+            lines += ['            text = "{}"'.format(text.replace('"', '""'))]
+    with atomic(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -21,14 +21,26 @@ from facediff.errors import FaceDiffError, check_known
 from facediff.speech.audio import write_wav
 from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.synthetic.articulation import speech_sounds
-from facediff.synthetic.cast import CAST, DRAWN, KEPT_OUT_PEOPLE, SEEN, UNSEEN, CastMember, drawn_names, member_of
+from facediff.synthetic.cast import (
+    CAST,
+    DRAWN,
+    KEPT_OUT_PEOPLE,
+    RECORDED,
+    RECORDED_FROM,
+    SEEN,
+    UNSEEN,
+    CastMember,
+    drawn_names,
+    member_of,
+    recorded_names,
+)
 from facediff.synthetic.head.mask import N_MASK_VERTICES, build_mask
 from facediff.synthetic.head.parts import AROUND_EYE, N_HEAD_VERTICES, build_head
 from facediff.synthetic.head.people import Complexion, coloured, dressed
 from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
 from facediff.synthetic.performance import MOODS, FaceMotion, synthesise_motion
 from facediff.synthetic.prosody import analyse
-from facediff.synthetic.recordings import ALIGNED, recordings_of
+from facediff.synthetic.recordings import recordings_of
 from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, WORDS, turn
 from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
@@ -102,15 +114,12 @@ def performed_clips(drawn: int = 0, people: Sequence[str] = ()) -> tuple[Perform
         plan.append((identity, "test_c", texts, voice))
     moods = tuple(MOODS)
     for index, name in enumerate(drawn_names(drawn)):
-        voice = member_of(name, people).voice
-        if voice.startswith(f"{ALIGNED}:"):  # recorded speakers say the recorded sentences
-            recordings = recordings_of(voice.partition(":")[2], REFERENCES_EACH)
-            plan += [
-                (name, "train", [(number, recording.text)], recording.voice)
-                for number, recording in enumerate(recordings, 1)
-            ]
-        else:
-            plan.append((name, "train", turn(TRAIN, 5 * index, 24), ""))
+        plan.append((name, "train", turn(TRAIN, 5 * index, 24), ""))
+    for name in recorded_names(people):  # who say the recorded sentences
+        recordings = recordings_of(member_of(name, people).voice.partition(":")[2], REFERENCES_EACH)
+        if len(recordings) == 1:  # in another mood, so that it has a style reference
+            recordings *= 2
+        plan += [(name, "train", [(number, each.text)], each.voice) for number, each in enumerate(recordings, 1)]
     return tuple(
         PerformedClip(identity, split, number, text, moods[(number + index) % len(moods)], voice)
         for index, (identity, split, texts, voice) in enumerate(plan)
@@ -218,7 +227,8 @@ def generate(
         root: the folder to make.
         seed: random seed; the same seed gives the same bytes.
         drawn: how many drawn speakers say training sentences, besides the cast of ten.
-        people: voices of people that every second drawn speaker speaks with; see :func:`people_voices`.
+        people: voices of people: recordings of people, each of whom is a speaker more, and others
+            (:func:`people_voices`), with which every second drawn speaker speaks.
         workers: how many workers share the work; by default one, or all of a cluster.
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
@@ -241,7 +251,8 @@ def generate(
             "writes": folder,
         }
         frames = sum(do_all(work, clips, **options, progress="Puppet corpus" if progress else ""))
-        counts = {"subjects": len(variant.speakers) + drawn, "vertices": vertex_count(variant), "frames": frames}
+        subjects = len(variant.speakers) + drawn + len(recorded_names(people))
+        counts = {"subjects": subjects, "vertices": vertex_count(variant), "frames": frames}
         more = {"whole": only is None, "clips": len(clips), **counts, "frame_rate": variant.frame_rate}
         write_json(folder / MANIFEST, {**facts, **more, "files": describe_files(folder)})
 
@@ -293,7 +304,7 @@ def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] =
     random = np.random.default_rng([number, len(WORDS), 2])
     text = " ".join(random.choice(WORDS, size=random.integers(5, 9)))
     identity = identities[int(random.integers(len(identities)))]
-    people = [voice for voice in people if not voice.startswith(ALIGNED)]  # recordings say their own words only
+    identities = [name for name in identities if not name.startswith(RECORDED)]  # recordings say their own words only
     return speak_clip(PerformedClip(identity, "train", 1, text, str(random.choice([*MOODS]))), people).samples
 
 
@@ -341,7 +352,8 @@ def perform_clip(
     contours = analyse(speech.samples, SAMPLE_RATE)
     frames = round(len(speech.samples) / SAMPLE_RATE * frame_rate)
     everybody = list(CAST)
-    invented = len(everybody) - 1 + int(clip.identity.removeprefix(DRAWN)) if clip.identity not in CAST else 0
+    number = int(clip.identity[1:]) + (RECORDED_FROM if clip.identity.startswith(RECORDED) else 0)
+    invented = len(everybody) - 1 + number if clip.identity not in CAST else 0
     key = [seed, invented or everybody.index(clip.identity), *map(ord, clip.sentence)]
     draws = _DRAWS if clip.split.startswith("test") else 1
     performances = [

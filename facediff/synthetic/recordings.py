@@ -16,10 +16,10 @@ from facediff.registry import puppet_voice
 from facediff.speech.audio import read_speech
 from facediff.speech.espeak import SpokenPhoneme, Utterance
 from facediff.speech.text_grids import REMEDY, SILENCES, WORDS, find_tier, phones_in, read_text_grid
+from facediff.synthetic.cast import ALIGNED
 from facediff.synthetic.voices import CMU_PHONES, Delivery, Synthesiser
 from facediff.utils import SAMPLE_RATE
 
-ALIGNED = "aligned"
 SOUNDS = (".wav", ".flac")
 LONGEST = 12.0  # Seconds of a recording that a corpus takes
 

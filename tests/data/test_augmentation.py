@@ -150,6 +150,17 @@ def test_training_hears_changed_speech_and_tests_do_not(puppet_of_two: str) -> N
         data.dataset("train", training=True)
 
 
+@pytest.mark.parametrize(("augmentation", "components"), [("tilt", True), ("pauses", False)])
+def test_changes_of_speech_alone_leave_training_on_components(
+    puppet_of_two: str, augmentation: str, components: bool
+) -> None:
+    """Reading vertices instead takes most of a small model's step."""
+    data = Puppet(root=puppet_of_two, augmentations=[f"{augmentation}:share=1"])
+    data.projection.choose(lambda motion: motion[:, :3, 0])
+    motion = data.dataset("train", training=True)[0].motion
+    assert motion.shape[1:] == ((3,) if components else (data.n_vertices, 3))
+
+
 def test_only_clips_that_fit_are_changed(puppet_of_two: str) -> None:
     def heard(**options: object) -> list[np.ndarray]:
         dataset = Puppet(root=puppet_of_two, **options).dataset("train", training=True)

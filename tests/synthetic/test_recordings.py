@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import shutil
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import soundfile
 
 from facediff.data import Puppet
 from facediff.errors import FaceDiffError
-from facediff.synthetic.corpus import generate, performed_clips
+from facediff.synthetic.cast import member_of
+from facediff.synthetic.corpus import generate, performed_clips, resting_head
 from facediff.synthetic.recordings import phones_of, read_text_grid, recordings_of, speakers_of
 from facediff.synthetic.voices import Delivery, installed_voices, open_voice
 
@@ -110,25 +112,31 @@ def test_a_recording_in_two_formats_is_one_and_capitals_do_not_matter(people: Pa
     assert len(open_voice(f"aligned:{first.with_suffix('')}").speak().samples)
 
 
-def test_drawn_speakers_speak_with_the_recordings_of_people(people: Path, tmp_path: Path) -> None:
+def test_recordings_add_a_speaker_for_each_person(people: Path, tmp_path: Path) -> None:
+    """Drawn speakers keep their voices and clips, and whoever has a single recording has a style reference too."""
+    (people / "174" / "a-1.flac").unlink()
     data = Puppet(root=str(tmp_path / "corpus"), drawn_speakers=3, recordings=str(people))
     voices = data.voices
     assert [Path(voice).name for voice in voices] == ["174", "84"]
-    clips = [clip for clip in performed_clips(3, voices) if clip.identity.startswith("X")]
-    assert [(clip.identity, Path(clip.voice).name) for clip in clips][:3] == [
-        ("X01", "a-1"),
-        ("X01", "a-2"),
-        ("X02", "a-1"),
+    assert data.identities[-5:] == ["X01", "X02", "X03", "P001", "P002"]
+    clips, without = performed_clips(3, voices), performed_clips(3)
+    assert clips[: len(without)] == without
+    assert [(clip.name, Path(clip.voice).name) for clip in clips[len(without) :]] == [
+        ("P001_e01", "a-2"),
+        ("P001_e02", "a-2"),
+        ("P002_e01", "a-1"),
+        ("P002_e02", "a-2"),
     ]
-    generate(tmp_path / "corpus", drawn=3, people=voices, only=[clips[0].name], progress=False)
-    with (tmp_path / "corpus" / "phonemes" / "X01_e01.csv").open(encoding="utf-8") as stream:
+    assert len({clip.mood for clip in clips[-4:-2]}) == 2
+    faces = [resting_head(member_of(name)) for name in ("X01", "X02", "P001", "P002")]
+    assert all(np.abs(one - other).max() > 1e-3 for one, other in itertools.combinations(faces, 2))
+    generate(tmp_path / "corpus", drawn=3, people=voices, only=["P002_e01"], progress=False)
+    with (tmp_path / "corpus" / "phonemes" / "P002_e01.csv").open(encoding="utf-8") as stream:
         phonemes = list(csv.DictReader(stream))
     assert "".join(row["ipa"] for row in phonemes) == "mɑmʌ"
-    speech, rate = soundfile.read(tmp_path / "corpus" / "wav" / "X01_e01.wav")
+    speech, rate = soundfile.read(tmp_path / "corpus" / "wav" / "P002_e01.wav")
     assert rate == 16_000
-    assert len(np.load(tmp_path / "corpus" / "weights_npy" / "X01_e01.npy")) == len(speech) / 640
-    with pytest.raises(FaceDiffError, match="one of them"):
-        Puppet(people_voices=True, recordings=str(people))
+    assert len(np.load(tmp_path / "corpus" / "weights_npy" / "P002_e01.npy")) == len(speech) / 640
 
 
 def test_two_folders_of_recordings_are_kept_apart(

@@ -1,0 +1,181 @@
+"""How a mouth articulates: whether it closes for p, b and m and for nothing else, opens for vowels and rounds.
+
+A mouth that hardly opens is closed in time as well: the share of closures within a millimetre says nothing without the
+share at any other moment. So every closure is ranked against the other sounds (AUC), and openings and widths are taken
+at the sounds that ask for them. Motion and truth of the same recordings give shares of the truth's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from facediff.speech.phonemes import BILABIALS, LENGTH, TimedPhoneme
+
+Array = npt.NDArray[np.float64]
+
+CLOSED = 1.0  # millimetres between the lips
+NEAR = 0.04  # seconds around the middle of a sound in which the lips may meet
+OPEN_VOWELS = ("a", "ɑ", "æ", "ɐ", "ɒ")
+ROUNDED = ("u", "ʊ", "w", "o", "ɔʊ", "əʊ", "oʊ")
+LABIODENTALS = ("f", "v")
+VOWELS = "iyɨʉɯuɪʏʊeøɘɵɤoəɛœɜɞʌɔæɐaɶɑɒɚɝᵻ"
+
+
+@dataclass(frozen=True, eq=False)
+class MouthMotion:
+    """The mouth of a recording, and what is said.
+
+    Attributes:
+        gap: (T,) between the inner lips, in millimetres beyond that of the face at rest.
+        width: (T,) from corner to corner, the same.
+        frame_rate: frames a second; frame t shows the face at (t + 0.5) / frame_rate.
+        phonemes: with times in seconds.
+        contact: (T,) from the lower lip to the upper teeth in millimetres, of faces that have teeth.
+    """
+
+    gap: Array
+    width: Array
+    frame_rate: float
+    phonemes: Sequence[TimedPhoneme]
+    contact: Array | None = None
+
+    def around(self, series: Array, phoneme: TimedPhoneme, pick: Callable[[Array], float]) -> float:
+        """The smallest, largest … value within :data:`NEAR` of a phoneme's middle."""
+        first = math.floor((phoneme.middle - NEAR) * self.frame_rate)
+        frames = series[max(first, 0) : math.ceil((phoneme.middle + NEAR) * self.frame_rate)]
+        return float(pick(frames)) if len(frames) else math.nan
+
+
+def mouth_motion(
+    vertices: npt.NDArray[np.floating],
+    template: npt.NDArray[np.floating],
+    lip_pairs: npt.NDArray[np.integer],
+    *,
+    millimetres: float,
+    frame_rate: float,
+    phonemes: Sequence[TimedPhoneme],
+) -> MouthMotion:
+    """The mouth of vertices (T, V, 3) of an upright face that looks along z, of (V, 3) at rest.
+
+    Args:
+        vertices: the motion.
+        template: the face at rest.
+        lip_pairs: (P, 2) of the inner lips, upper and lower; the outermost are the corners.
+        millimetres: that a unit of length has.
+        frame_rate: frames a second.
+        phonemes: of the speech.
+    """
+    upper, lower = np.asarray(lip_pairs).T
+    order = np.argsort(template[upper, 0])
+    right, left = upper[order[0]], upper[order[-1]]
+
+    def gaps(faces: npt.NDArray[np.floating]) -> Array:
+        return np.asarray(np.linalg.norm(faces[..., upper, :] - faces[..., lower, :], axis=-1).mean(-1), np.float64)
+
+    def widths(faces: npt.NDArray[np.floating]) -> Array:
+        return np.asarray(np.linalg.norm(faces[..., left, :] - faces[..., right, :], axis=-1), np.float64)
+
+    gap, width = (millimetres * (of(vertices) - of(template)) for of in (gaps, widths))
+    return MouthMotion(gap, width, frame_rate, phonemes)
+
+
+@dataclass(frozen=True)
+class ArticulationScores:
+    """Scores of one or several recordings; NaN where their speech does not have the sounds.
+
+    Attributes:
+        closure_auc: how well gaps tell p, b and m from all other sounds: 0.5 by chance, 1 at best.
+        closed: share of p, b and m at which the lips come within 1 mm.
+        chance: the same share of all other sounds.
+        open_vowels: mean opening of a, ɑ, æ … in millimetres.
+        rounding: width of the mouth at u, o and w less that at other vowels, in millimetres; negative if it rounds.
+        rounding_auc: how well widths tell these sounds apart.
+        contact: share of f and v at which the lower lip comes within 1 mm of the upper teeth.
+    """
+
+    closure_auc: float
+    closed: float
+    chance: float
+    open_vowels: float
+    rounding: float
+    rounding_auc: float
+    contact: float = math.nan
+
+    def shares_of(self, truth: ArticulationScores) -> dict[str, float]:
+        """Opening and rounding as shares of the truth's."""
+        return {name: getattr(self, name) / getattr(truth, name) for name in ("open_vowels", "rounding")}
+
+
+def articulation(recordings: Sequence[MouthMotion]) -> ArticulationScores:
+    """The scores over all sounds of recordings."""
+    sounds = [(each, phoneme, phoneme.plain.rstrip(LENGTH)) for each in recordings for phoneme in each.phonemes]
+    sounds = [sound for sound in sounds if sound[2] and sound[1].middle * sound[0].frame_rate < len(sound[0].gap)]
+
+    def values(series: str, pick: Callable[[Array], float], fits: Callable[[str], bool]) -> Array:
+        found = [each.around(getattr(each, series), phoneme, pick) for each, phoneme, ipa in sounds if fits(ipa)]
+        return np.array([value for value in found if not math.isnan(value)])
+
+    closing = values("gap", np.min, lambda ipa: ipa in BILABIALS)
+    others = values("gap", np.min, lambda ipa: ipa not in BILABIALS)
+    opened = values("gap", np.max, lambda ipa: ipa.startswith(OPEN_VOWELS))
+    rounded = values("width", np.mean, lambda ipa: ipa.startswith(ROUNDED))
+    spread = values("width", np.mean, lambda ipa: ipa[0] in VOWELS and not ipa.startswith(ROUNDED))
+    touching = np.array([])
+    if all(each.contact is not None for each in recordings):
+        touching = values("contact", np.min, lambda ipa: ipa in LABIODENTALS)
+    return ArticulationScores(
+        closure_auc=area_under_curve(-closing, -others),
+        closed=_mean(closing < CLOSED),
+        chance=_mean(others < CLOSED),
+        open_vowels=_mean(opened),
+        rounding=_mean(rounded) - _mean(spread),
+        rounding_auc=area_under_curve(-rounded, -spread),
+        contact=_mean(touching < CLOSED),
+    )
+
+
+def by_speaker(
+    recordings: Mapping[str, Sequence[MouthMotion]], *, seed: int = 0
+) -> dict[str, tuple[float, float, float]]:
+    """Mean over speakers and 95 % interval of each score, by speakers drawn again with replacement (NaN: left out).
+
+    Args:
+        recordings: of each speaker.
+        seed: of the draws.
+    """
+    rows = [articulation(each) for each in recordings.values()]
+    random = np.random.default_rng(seed)
+    drawn = random.integers(len(rows), size=(1000, len(rows)))
+    found = {}
+    for field in fields(ArticulationScores):
+        column = np.array([getattr(row, field.name) for row in rows])
+        if np.isnan(column).all():
+            continue
+        counts = (~np.isnan(column[drawn])).sum(1)
+        means = np.nansum(column[drawn], axis=1)[counts > 0] / counts[counts > 0]
+        low, high = np.quantile(means, [0.025, 0.975]).tolist()
+        found[field.name] = (float(np.nanmean(column)), low, high)
+    return found
+
+
+def area_under_curve(higher: Array, lower: Array) -> float:
+    """The share of pairs in which a value of the first kind exceeds one of the second; ties count half.
+
+    Example:
+        >>> area_under_curve(np.array([3.0, 2.0]), np.array([1.0, 2.0]))
+        0.875
+    """
+    if not len(higher) or not len(lower):
+        return math.nan
+    ordered = np.sort(lower)
+    below = np.searchsorted(ordered, higher, "left") + np.searchsorted(ordered, higher, "right")
+    return float(below.mean() / (2 * len(lower)))
+
+
+def _mean(values: npt.NDArray[np.generic]) -> float:
+    return float(np.mean(values)) if len(values) else math.nan
