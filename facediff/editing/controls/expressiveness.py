@@ -162,13 +162,24 @@ def region_weights(
     weights = np.zeros((len(region_names), len(points)))
     for row, region in zip(weights, region_names, strict=True):
         distances = np.full(len(points), np.inf)
-        if len(regions[region]):  # a face that was carried to a mesh without the region has none
-            distances = nearest_distances(points, points[regions[region]], width)
+        members = with_jaw(points, regions) if region == "lips" else regions[region]
+        if len(members):  # a face that was carried to a mesh without the region has none
+            distances = nearest_distances(points, points[members], width)
         row[:] = 1.0 - smooth_step(distances / max(width, 1e-12))
     # Where regions overlap, their weights are made to sum to one; without it, two factors of 1 would scale by 2.
     total = weights.sum(axis=0)
     weights /= np.maximum(total, 1.0)
     return RegionWeights(region_names, weights, np.clip(1.0 - total, 0.0, None))
+
+
+def with_jaw(points: Array, regions: Mapping[str, npt.NDArray[np.integer]]) -> npt.NDArray[np.integer]:
+    """The lips and all vertices below them (V,): lips that open further by themselves leave the chin behind."""
+    lips, brows = regions["lips"], regions.get("upper_face", ())
+    if not len(lips) or not len(brows):
+        return lips
+    down = points[lips].mean(0) - points[brows].mean(0)
+    depth = points @ (down / max(float(np.linalg.norm(down)), 1e-12))
+    return np.union1d(lips, np.flatnonzero(depth > depth[lips].max()))
 
 
 def rest_weights(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.editing.controls.expressiveness import FALL_OFF, region_factors
+from facediff.editing.controls.expressiveness import FALL_OFF, region_factors, with_jaw
 from facediff.editing.controls.eyelids import Eyes
 from tests.fakes.single_controls import scale_regions
 
@@ -35,10 +35,22 @@ def test_a_region_gets_its_own_factor_and_what_is_far_the_rest(make_animation: C
         after[animation.regions["upper_face"]], 1.5 * before[animation.regions["upper_face"]], atol=1e-7
     )
     size = np.linalg.norm(np.ptp(animation.template, axis=0))
-    both = np.concatenate([animation.regions["lips"], animation.regions["upper_face"]])
+    jaw = with_jaw(animation.template.astype(np.float64), animation.regions)
+    np.testing.assert_allclose(after[jaw], 0.5 * before[jaw], atol=1e-7)
+    both = np.concatenate([jaw, animation.regions["upper_face"]])
     far = np.linalg.norm(animation.template[:, None] - animation.template[both], axis=-1).min(1) > FALL_OFF * size
     assert far.sum() > 200
     np.testing.assert_allclose(after[far], 1.1 * before[far], atol=1e-7)
+
+
+def test_lips_take_the_jaw_along(make_animation: Callable[..., Animation]) -> None:
+    """An avatar that is driven by shapes opens its jaw as far as the lips ask for."""
+    animation = make_animation(2, jawOpen=0.4)
+    opened = make_animation(2, jawOpen=0.6)
+    scaled = scale_regions(animation, {"lips": 1.5})
+    below = with_jaw(animation.template.astype(np.float64), animation.regions)
+    assert len(below) > 2 * len(animation.regions["lips"])
+    np.testing.assert_allclose(scaled.vertices[1][below], opened.vertices[1][below], atol=1e-6)
 
 
 @pytest.mark.parametrize("factors", [{"lips": 4.0}, {"upper_face": 3.0, "lips": 0.0}, {"upper_face": 2.0, "all": 0.5}])
