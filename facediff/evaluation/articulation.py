@@ -14,12 +14,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from facediff.speech.phonemes import BILABIALS, LENGTH, TimedPhoneme
+from facediff.speech.phonemes import TimedPhoneme, closing
 
 Array = npt.NDArray[np.float64]
 
 CLOSED = 1.0  # millimetres between the lips
 NEAR = 0.04  # seconds around the middle of a sound in which the lips may meet
+LENGTH = "ː"
 OPEN_VOWELS = ("a", "ɑ", "æ", "ɐ", "ɒ")
 ROUNDED = ("u", "ʊ", "w", "o", "ɔʊ", "əʊ", "oʊ")
 LABIODENTALS = ("f", "v")
@@ -113,15 +114,18 @@ class ArticulationScores:
 
 def articulation(recordings: Sequence[MouthMotion]) -> ArticulationScores:
     """The scores over all sounds of recordings."""
-    sounds = [(each, phoneme, phoneme.plain.rstrip(LENGTH)) for each in recordings for phoneme in each.phonemes]
-    sounds = [sound for sound in sounds if sound[2] and sound[1].middle * sound[0].frame_rate < len(sound[0].gap)]
+    sounds: list[tuple[MouthMotion, TimedPhoneme, str]] = []
+    for each in recordings:
+        bilabials = closing([phoneme.ipa for phoneme in each.phonemes])
+        names = [b or phoneme.plain.rstrip(LENGTH) for phoneme, b in zip(each.phonemes, bilabials, strict=True)]
+        sounds += [(each, phoneme, ipa) for phoneme, ipa in zip(each.phonemes, names, strict=True) if ipa]
 
     def values(series: str, pick: Callable[[Array], float], fits: Callable[[str], bool]) -> Array:
         found = [each.around(getattr(each, series), phoneme, pick) for each, phoneme, ipa in sounds if fits(ipa)]
         return np.array([value for value in found if not math.isnan(value)])
 
-    closing = values("gap", np.min, lambda ipa: ipa in BILABIALS)
-    others = values("gap", np.min, lambda ipa: ipa not in BILABIALS)
+    shut = values("gap", np.min, lambda ipa: ipa in ("p", "b", "m"))
+    others = values("gap", np.min, lambda ipa: ipa not in ("p", "b", "m"))
     opened = values("gap", np.max, lambda ipa: ipa.startswith(OPEN_VOWELS))
     rounded = values("width", np.mean, lambda ipa: ipa.startswith(ROUNDED))
     spread = values("width", np.mean, lambda ipa: ipa[0] in VOWELS and not ipa.startswith(ROUNDED))
@@ -129,8 +133,8 @@ def articulation(recordings: Sequence[MouthMotion]) -> ArticulationScores:
     if all(each.contact is not None for each in recordings):
         touching = values("contact", np.min, lambda ipa: ipa in LABIODENTALS)
     return ArticulationScores(
-        closure_auc=area_under_curve(-closing, -others),
-        closed=_mean(closing < CLOSED),
+        closure_auc=area_under_curve(-shut, -others),
+        closed=_mean(shut < CLOSED),
         chance=_mean(others < CLOSED),
         open_vowels=_mean(opened),
         rounding=_mean(rounded) - _mean(spread),
