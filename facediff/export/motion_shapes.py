@@ -88,17 +88,14 @@ def split_signs(scores: Array, axes: Array) -> tuple[Array, Array]:
     """Weights (T, M) from 0 to 1 and shapes (M, 3V): the positive and the negative half of every component."""
     # Programs that clamp weights (Blender clamps shape keys to 0 … 1) would break the signed weights of principal
     # components. Between two frames the sum of both halves is as linear as the component, so that nothing is lost.
-    weights, shapes = [], []
-    for score, axis in zip(scores.T, axes, strict=True):
-        for sign in (1, -1):
-            half = np.maximum(sign * score, 0)
-            peak = half.max(initial=0)
-            if peak > 0:
-                weights.append(half / peak)
-                shapes.append(sign * peak * axis)
-    if not weights:  # a face that never moves still needs something to animate
+    peaks = [(k, sign, (sign * column).max(initial=0)) for k, column in enumerate(scores.T) for sign in (1, -1)]
+    peaks = [(k, sign, peak) for k, sign, peak in peaks if peak > 0]
+    if not peaks:  # a face that never moves still needs something to animate
         return np.zeros((len(scores), 1), np.float32), np.zeros((1, axes.shape[1]), np.float32)
-    return np.stack(weights, 1), np.stack(shapes)
+    weights = np.empty((len(scores), len(peaks)), scores.dtype)  # once: of an hour they take 100 MB
+    for half, (k, sign, peak) in zip(weights.T, peaks, strict=True):
+        np.divide(np.maximum(sign * scores[:, k], 0), peak, out=half)
+    return weights, np.stack([sign * peak * axes[k] for k, sign, peak in peaks])
 
 
 def largest_error(flat: Array, weights: Array, shapes: Array) -> float:
@@ -125,8 +122,8 @@ def compress_long(parts: Parts, tolerance: float) -> tuple[Array, Array, int] | 
         low, high = 0, len(axes)
         while high - low > 1:  # as in compress, by some of the frames
             middle = (low + high) // 2
-            weights, shapes = split_signs(scores[:, :middle], axes[:middle])
-            low, high = (low, middle) if largest_error(probes, weights[frames], shapes) <= tolerance else (middle, high)
+            enough = largest_error(probes, *split_signs(scores[frames, :middle], axes[:middle])) <= tolerance
+            low, high = (low, middle) if enough else (middle, high)
         while True:  # and all of them have the last word
             weights, shapes = split_signs(scores[:, :high], axes[:high])
             if within(parts(), weights, shapes, tolerance):
