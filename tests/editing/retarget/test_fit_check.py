@@ -33,8 +33,8 @@ def carried(animation: Animation, head: Head) -> tuple[Animation, Correspondence
 
 
 QUICK = ("slit mask",)
-EYES_REST = ("mask", "scan", "painted eyes", "few triangles")
-"""Heads whose eyes are one skin, or whose lids have too few triangles to meet without a hole."""
+EYES_REST = ("mask", "scan", "painted eyes")
+"""Heads whose eyes are one skin."""
 RAGGED = ("re-meshed head",)
 """Heads in whose lips no line is found: refused, as the manual says."""
 
