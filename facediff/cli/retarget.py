@@ -138,7 +138,7 @@ def write_transferred(
     def judge(transferred: Animation, fit: Correspondence, report: FitReport) -> None:
         reports.append(report)
         if options.show is not None:  # the picture shows the fault
-            draw_correspondence(options.show, motion, transferred, fit)
+            draw_correspondence(options.show, motion, with_pictures(transferred, target), fit)
         if not options.accept_poor:
             refuse_poor(target, reports[-1])
 
@@ -166,6 +166,18 @@ def write_transferred(
     written += [] if options.show is None else [options.show]
     lines = [*remarks(motion, transferred, fit, reports[-1]), *axes_notes(fit, output, dressed), *notes]
     tell(*written, *(line for line in lines if not options.quiet or line.startswith("WARNING")))
+
+
+def with_pictures(animation: Animation, mesh: Path) -> Animation:
+    """An animation in the colours of its mesh's pictures, if it has some."""
+    from facediff.mesh.textures import has_textures, read_textures
+
+    if not has_textures(mesh):
+        return animation
+    textures = read_textures(mesh, len(animation.triangles))
+    if all(material.picture is None for material in textures.materials):
+        return animation
+    return replace(animation, colours=textures.at_vertices(animation.triangles, len(animation.template)))
 
 
 PICKED = ".landmarks.json"

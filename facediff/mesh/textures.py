@@ -6,6 +6,7 @@ file from elsewhere opens nothing outside of it. A .glb holds its pictures itsel
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, damaged
+from facediff.errors import FaceDiffError, damaged, needs_extra
 from facediff.mesh.glb import Glb, attributes, open_glb, whole_number
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
@@ -65,6 +66,24 @@ class Textures:
         """The corners for the same triangles (F, 3) with their vertices in another order."""
         order = (outward[:, :, None] == triangles[:, None, :]).argmax(axis=2)
         return np.take_along_axis(self.corners, order, axis=1)
+
+    def at_vertices(self, triangles: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.uint8]:
+        """Colours (count, 3) of the vertices of the triangles (F, 3): of the pictures, or else of the materials."""
+        with needs_extra("PIL", "render", "reading pictures"):
+            from PIL import Image
+        colours = np.full((count, 3), 200, np.uint8)
+        for number, material in enumerate(self.materials):
+            some = self.of_face == number
+            vertices, (u, v) = triangles[some].ravel(), self.uvs[self.corners[some].ravel()].T
+            if (picture := material.picture_bytes()) is None:
+                colours[vertices] = np.rint(255 * np.array(material.colour))
+                continue
+            pixels = np.asarray(Image.open(io.BytesIO(picture[0])).convert("RGB"))
+            height, width, _ = pixels.shape
+            # Coordinates beyond 0 to 1 repeat the picture.
+            row, column = ((1 - v) % 1 * height).astype(int), (u % 1 * width).astype(int)
+            colours[vertices] = pixels[np.minimum(row, height - 1), np.minimum(column, width - 1)]
+        return colours
 
 
 def has_textures(path: Path) -> bool:

@@ -14,6 +14,7 @@ from PIL import Image
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
 from facediff.cli.app import main
+from facediff.cli.retarget import with_pictures
 from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.mesh import read_mesh
@@ -90,6 +91,19 @@ def test_glb_has_seams_materials_and_the_picture(
     # Colours of glTF are linear light.
     linear = ((np.array([0.2, 0.4, 0.6]) + 0.055) / 1.055) ** 2.4
     assert np.asarray(parts["cloth"].visual.material.baseColorFactor)[:3] / 255 == pytest.approx(linear, abs=0.01)
+
+
+def test_vertices_have_the_colours_of_pictures_in_the_check_of_a_transfer(source: Path, animation: Animation) -> None:
+    shown = with_pictures(animation, source).colours
+    assert shown is not None
+    pixels = np.asarray(Image.open(source.parent / "skin.png")).reshape(-1, 3).tolist()
+    cloth = (np.array([0.2, 0.4, 0.6]) * 255).round().tolist()
+    of_skin, of_cloth = (np.unique(animation.triangles[some]) for some in (slice(0, 6), slice(6, 12)))
+    assert all(colour in [*pixels, cloth] for colour in shown.tolist())
+    assert shown[of_cloth].tolist() == [cloth] * len(of_cloth)  # the last material to reach a vertex
+    corner = np.setdiff1d(of_skin, of_cloth)
+    assert all(colour in pixels for colour in shown[corner].tolist())
+    assert with_pictures(animation, source.with_suffix(".mtl")) is animation
 
 
 def test_obj_frames_share_materials_and_may_be_written_again(
