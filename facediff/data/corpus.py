@@ -36,7 +36,7 @@ from facediff.utils.arrays import ArrayStore, read_arrays
 from facediff.utils.checksums import sha256
 from facediff.utils.files import cache_dir
 from facediff.utils.limits import COORDINATE, quoted
-from facediff.utils.paths import composed
+from facediff.utils.paths import compose
 from facediff.utils.pickles import load_pickle
 from facediff.utils.plain_files import read_columns, read_table
 
@@ -372,7 +372,7 @@ def read_templates(path: Path, n_vertices: int | None = None) -> dict[str, Tenso
     if n_vertices is None:
         n_vertices = np.size(next(iter(loaded.values()), ())) // 3
     faces = [(name, as_template(path, name, value, n_vertices)) for name, value in loaded.items()]
-    return {composed(name): torch.from_numpy(face) for name, face in faces}
+    return {compose(name): torch.from_numpy(face) for name, face in faces}
 
 
 def load_template_dict(path: Path) -> dict[Any, Any]:
@@ -416,7 +416,7 @@ def read_clip_table(root: Path) -> dict[str, dict[str, str]]:
     header, rows = read_columns(path, CLIP_COLUMNS, remedy=remedy)
     table: dict[str, dict[str, str]] = {}
     for number, cells in enumerate(rows, 2):
-        row = {key: composed(cell) for key, cell in zip(header, cells, strict=False) if key}
+        row = {key: compose(cell) for key, cell in zip(header, cells, strict=False) if key}
         fits = len(cells) >= len(header) and not any(cells[len(header) :])
         if not fits or not all(map(str.isprintable, row.values())) or row.get("clip") in (None, *table):
             raise FaceDiffError(

@@ -16,7 +16,7 @@ from facediff.spaces.operations import at_times, permuted
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
-from facediff.utils.paths import existing, name_of_file
+from facediff.utils.paths import find_file, name_of_file
 
 USUAL_SUFFIXES = (".csv", ".json")
 
@@ -57,7 +57,7 @@ class RecordingFolder(ChannelFolder):
             if path.suffix.lower() not in self.suffixes or path.name.startswith(".") or not path.is_file():
                 continue
             name = name_of_file(path)
-            beside = (existing(path.with_suffix(suffix)) for suffix in (".wav", ".WAV"))
+            beside = (find_file(path.with_suffix(suffix)) for suffix in (".wav", ".WAV"))
             sound = next((sound for sound in beside if sound.is_file()), sounds.get(name))
             if sound is None or not sound.is_file():
                 continue

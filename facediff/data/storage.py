@@ -14,7 +14,7 @@ from facediff.spaces import Space
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore, open_array, open_vertices
 from facediff.utils.limits import COORDINATE, in_range
-from facediff.utils.paths import existing, name_of_file
+from facediff.utils.paths import find_file, name_of_file
 
 MOTION_FOLDERS = ("vertices_npy", "vertex")
 """Folders with absolute vertices, in order of preference; the second is ProbTalk3D's."""
@@ -87,7 +87,7 @@ class ClipFolder:
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
-        return read_stretch(existing(self.root / "wav" / f"{name}.wav"), first, length, store, self._complete)
+        return read_stretch(find_file(self.root / "wav" / f"{name}.wav"), first, length, store, self._complete)
 
     def version(self, name: str) -> object:
         """Size and time of the clip's motion file."""
@@ -111,7 +111,7 @@ class ChannelFolder(ClipFolder):
 
     def path_of(self, name: str) -> Path:
         """The file with a clip's channels."""
-        return existing(self.root / self.folder / f"{name}.npy")
+        return find_file(self.root / self.folder / f"{name}.npy")
 
     def open(self, name: str) -> ClipMotion:
         """Read a clip's channels."""
@@ -281,5 +281,5 @@ def rig_path(path: Path) -> Path | None:
 
 def motion_path(root: Path, name: str) -> Path:
     """The file with a clip's vertices, or else weights; the usual place if there is none."""
-    paths = [existing(root / folder / f"{name}.npy") for folder in (*MOTION_FOLDERS, WEIGHTS_FOLDER)]
+    paths = [find_file(root / folder / f"{name}.npy") for folder in (*MOTION_FOLDERS, WEIGHTS_FOLDER)]
     return next((path for path in paths if path.is_file()), paths[0])

@@ -42,7 +42,7 @@ from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import SAMPLE_RATE, read_speech
 from facediff.speech.phonemes import closures, phonemes_file, read_phonemes
 from facediff.utils import ranges
-from facediff.utils.paths import existing, from_home, name_of_file
+from facediff.utils.paths import find_file, from_home, name_of_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,7 +261,7 @@ def score_renders(
         raise FaceDiffError(f"--render draws motion, and lacks {lacking}; give it")
 
     def speech(clip: str) -> npt.NDArray[np.float32]:
-        path = None if options.corpus is None else existing(options.corpus / "wav" / f"{clip}.wav")
+        path = None if options.corpus is None else find_file(options.corpus / "wav" / f"{clip}.wav")
         return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
 
     drawing = RenderScorer(
@@ -358,7 +358,7 @@ class CorpusInputs:
         if corpus is None:
             return inputs
         if "speech" in needed:
-            inputs["waveform"] = torch.from_numpy(read_speech(existing(corpus / "wav" / f"{clip}.wav")))
+            inputs["waveform"] = torch.from_numpy(read_speech(find_file(corpus / "wav" / f"{clip}.wav")))
         if "closures" in needed and rate is not None:
             file = phonemes_file(corpus, clip)
             inputs["closures"] = [] if file is None else closures(read_phonemes(file), rate)

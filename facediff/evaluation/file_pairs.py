@@ -13,7 +13,7 @@ from facediff.data.corpus import ALL, EYELID_PAIRS, LIP_PAIRS, MOTION_FOLDERS, f
 from facediff.errors import FaceDiffError
 from facediff.metrics import TOPOLOGIES, EyelidPairs, LipPairs, Region
 from facediff.utils.arrays import open_vertices
-from facediff.utils.paths import composed
+from facediff.utils.paths import compose
 
 
 @contextmanager
@@ -62,14 +62,14 @@ class NamePattern:
 
     def __init__(self, pattern: str, subjects: Collection[str] = ()) -> None:
         self.pattern = pattern
-        parts = re.split(r"\{(\w*)\}", composed(pattern).removesuffix(".npy"))
+        parts = re.split(r"\{(\w*)\}", compose(pattern).removesuffix(".npy"))
         fields = parts[1::2]
         if sorted(fields) not in (sorted(FIELDS), sorted(FIELDS[:2])) or "{" in "".join(parts[::2]):
             raise FaceDiffError(
                 f"{pattern}: a pattern of file names has {{subject}} and {{sentence}} once each, may have "
                 f"{{identity}} once, and has no other field"
             )
-        speakers = "|".join(re.escape(composed(name)) for name in sorted(subjects, key=len, reverse=True))
+        speakers = "|".join(re.escape(compose(name)) for name in sorted(subjects, key=len, reverse=True))
         readings = [{"subject": speakers, "sentence": "[^/]+"}] if speakers else []
         if "identity" in fields and fields.index("subject") < fields.index("identity"):
             readings.append({"subject": "[^/]+", "sentence": "[^/]+", "identity": "(?P=subject)"})
@@ -86,7 +86,7 @@ class NamePattern:
 
     def match(self, name: str) -> Name | None:
         """The fields of a name; None if it is not of this pattern."""
-        match = next((match for reading in self._readings if (match := reading.fullmatch(composed(name)))), None)
+        match = next((match for reading in self._readings if (match := reading.fullmatch(compose(name)))), None)
         return Name(**match.groupdict()) if match else None
 
 

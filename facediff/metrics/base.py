@@ -355,12 +355,12 @@ class ExactMetric(Metric):
 
     full_state_update = False
     is_differentiable = False
-    _given: tuple[tuple[Any, ...], dict[str, Any]] = ((), {})
+    _arguments: tuple[tuple[Any, ...], dict[str, Any]] = ((), {})
 
     def __new__(cls, *arguments: Any, **options: Any) -> Self:  # noqa: ANN401
         """Keep the arguments, by which a collection tells metrics apart."""
         metric = super().__new__(cls)
-        metric.__dict__["_given"] = arguments, options
+        metric.__dict__["_arguments"] = arguments, options
         return metric
 
     def __init__(
@@ -376,12 +376,12 @@ class ExactMetric(Metric):
         # A MetricCollection merges metrics of which all states have the same names and nearly the same values after the
         # first batch: a signed and an absolute deviation, metres and millimetres of a perfect one. The name of a state
         # tells metrics apart that differ in an argument.
-        positional, named = self._given
+        positional, named = self._arguments
         parameters = list(inspect.signature(type(self).__init__).parameters.values())[1:]
         names = [parameter.name for parameter in parameters]
-        given = dict(zip(names, positional, strict=False)) | named
+        stated = dict(zip(names, positional, strict=False)) | named
         defaults = {each.name: each.default for each in parameters if each.default is not inspect.Parameter.empty}
-        arguments = {name: _identity(value) for name, value in sorted({**defaults, **given}.items())}
+        arguments = {name: _identity(value) for name, value in sorted({**defaults, **stated}.items())}
         described = f"{type(self).__module__}.{type(self).__qualname__}: {definition}; {arguments}"
         mark = hashlib.sha256(described.encode()).hexdigest()[:16]
         self.add_state(f"definition_{mark}", torch.zeros(1, dtype=torch.int64), dist_reduce_fx="sum")

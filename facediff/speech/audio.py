@@ -69,13 +69,13 @@ RESTART = 1.0
 STEP = 4096
 """Samples over which channels may cancel."""
 
-CANCELLED, LOST = 0.6, 0.1
+CANCELLATION, LOSS = 0.6, 0.1
 """Share of the energy of unrelated channels below which channels cancel, and of all energy that may be lost so."""
 
-SILENT = 1e-4
+SILENCE = 1e-4
 """Share of the loudest channel's energy below which a channel has no sound."""
 
-OVERSHOOT, LOUD = 1.5, 8.0
+OVERSHOOT, WHOLE_NUMBERS = 1.5, 8.0
 """Peaks that lossy codecs and resampling reach, and above which samples are whole numbers."""
 
 LENGTH_IS_KNOWN = ("WAV", "WAVEX", "RF64", "AIFF")
@@ -117,7 +117,7 @@ def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
 
 def _read(source: Path | IO[bytes], name: str, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
     """Mono samples (S,) of a file and their rate, by libsndfile or, where that knows no such content, by PyAV."""
-    with _opened(source, name) as stream:
+    with _open_stream(source, name) as stream:
         stream.seek(0)
         refuse_cut_short(stream, name)
         try:
@@ -146,7 +146,7 @@ class LostSamplesError(FaceDiffError):
 
 
 @contextmanager
-def _opened(source: Path | IO[bytes], name: str) -> Iterator[IO[bytes]]:
+def _open_stream(source: Path | IO[bytes], name: str) -> Iterator[IO[bytes]]:
     """A file as a stream of bytes: a library that opens it by itself would go by its name and by files beside it."""
     if not isinstance(source, Path):
         yield source if getattr(source, "seekable", lambda: False)() else io.BytesIO(source.read())
@@ -186,7 +186,7 @@ def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.flo
             f"{name}: holds no samples, or up to {peak:g}; expected speech of finite numbers with a full scale of 1"
         )
     if peak > 1.001:
-        scale = next(full for full in (2.0**15, 2.0**23, LOUDEST) if peak <= full) if peak > LOUD else peak
+        scale = next(full for full in (2.0**15, 2.0**23, LOUDEST) if peak <= full) if peak > WHOLE_NUMBERS else peak
         if peak > OVERSHOOT:
             note(f"{name}: its samples reach {peak:g} where full scale is 1; they are divided by {scale:g}")
         samples = samples / np.float32(scale)
@@ -221,19 +221,19 @@ def mono(
         each = np.add.reduceat(np.square(block, dtype=np.float64), starts, axis=0)
         together = np.add.reduceat(np.square(mixed, dtype=np.float64), starts) * block.shape[1] ** 2
         energy, unrelated = energy + each.sum(axis=0), each.sum(axis=1)
-        spent, lost = spent + float(unrelated.sum()), lost + float(unrelated[together < CANCELLED * unrelated].sum())
+        spent, lost = spent + float(unrelated.sum()), lost + float(unrelated[together < CANCELLATION * unrelated].sum())
         return mixed
 
-    samples = _joined(map(mean, blocks()), length)
-    if lost > LOST * spent:
+    samples = _join(map(mean, blocks()), length)
+    if lost > LOSS * spent:
         loudest = int(energy.argmax())
         say(f"{name}: its channels cancel each other; channel {loudest + 1} alone is taken")
-        return _joined((block[:, loudest] for block in blocks()), length)
-    sounding = int((energy > SILENT * energy.max()).sum())
-    return samples if sounding in (0, len(energy)) else samples * np.float32(len(energy) / sounding)
+        return _join((block[:, loudest] for block in blocks()), length)
+    with_sound = int((energy > SILENCE * energy.max()).sum())
+    return samples if with_sound in (0, len(energy)) else samples * np.float32(len(energy) / with_sound)
 
 
-def _joined(pieces: Iterable[npt.NDArray[np.floating]], length: int | None) -> Samples:
+def _join(pieces: Iterable[npt.NDArray[np.floating]], length: int | None) -> Samples:
     if length is None:
         parts = [np.array(piece, np.float32) for piece in pieces]
         return np.concatenate(parts) if parts else np.zeros(0, np.float32)
@@ -273,7 +273,7 @@ def open_sound(source: Path | IO[bytes], name: str = "") -> Iterator[Any]:
 
     name = name or str(source)
     try:
-        with _opened(source, name) as stream, soundfile.SoundFile(stream) as file:
+        with _open_stream(source, name) as stream, soundfile.SoundFile(stream) as file:
             yield file
     except (soundfile.LibsndfileError, RuntimeError, TypeError, ValueError, OSError) as error:
         raise FaceDiffError(
@@ -291,7 +291,7 @@ def _decoded(file: Any, name: str, limit: float | None) -> tuple[Samples, int]: 
     """All samples (S,) of a ``soundfile.SoundFile``."""
     declared, rate = int(file.frames), int(file.samplerate)
     counted_frames = 0 <= declared < UNKNOWN
-    estimated = file.subtype.startswith("MPEG")  # unless a frame of an mp3 tells the number of frames
+    is_estimate = file.subtype.startswith("MPEG")  # unless a frame of an mp3 tells the number of frames
     _check_length(name, declared / rate if counted_frames else 0, limit)
 
     def blocks() -> Iterator[npt.NDArray[np.float32]]:
@@ -302,12 +302,12 @@ def _decoded(file: Any, name: str, limit: float | None) -> tuple[Samples, int]: 
             decoded += len(block)
             _check_length(name, decoded / rate, limit)
             yield block
-        if counted_frames and decoded < declared and not estimated:
+        if counted_frames and decoded < declared and not is_estimate:
             raise LostSamplesError(
                 f"{name}: is cut short or damaged: {decoded} of {declared} samples can be decoded; copy it again"
             )
 
-    is_known = file.format in LENGTH_IS_KNOWN and counted_frames and not estimated
+    is_known = file.format in LENGTH_IS_KNOWN and counted_frames and not is_estimate
     return mono(blocks, name, declared if is_known else None), rate
 
 
@@ -326,19 +326,19 @@ def _decode_container(stream: IO[bytes], name: str, limit: float | None, refusal
     except MissingExtraError as error:
         raise (error if Path(name).suffix.lower() in CONTAINERS else refusal) from error
 
-    def opened() -> Any:  # noqa: ANN401
+    def open_container() -> Any:  # noqa: ANN401
         stream.seek(0)
         return av.open(stream, options={"format_whitelist": DEMUXERS})
 
     tracks: list[tuple[float, Samples, list[str]]] = []
     try:
-        with opened() as container:
+        with open_container() as container:
             rates = [int(track.rate) for track in container.streams.audio]
         if not rates:
             raise FaceDiffError(f"{name}: has no sound track; expected a video with speech")
         for number, rate in enumerate(rates):
             notes: list[str] = []
-            samples = mono(partial(_track, opened, number, name, limit, notes.append), name, say=notes.append)
+            samples = mono(partial(_track, open_container, number, name, limit, notes.append), name, say=notes.append)
             clear = loudness_range(_resampled(samples, rate, SAMPLE_RATE)) if len(rates) > 1 else math.inf
             tracks.append((clear, samples, notes))
             if clear >= NOISY:
@@ -357,17 +357,17 @@ def _decode_container(stream: IO[bytes], name: str, limit: float | None, refusal
 
 
 def _track(
-    opened: Callable[[], Any], number: int, name: str, limit: float | None, say: Callable[[str], None]
+    open_container: Callable[[], Any], number: int, name: str, limit: float | None, say: Callable[[str], None]
 ) -> Iterator[npt.NDArray[np.float32]]:
     """Samples (n, channels) of a sound track, with silence where its packets' times jump."""
-    done, start, aligned, faults = 0, None, False, Counter[str]()
-    with opened() as container:
+    done, start, in_step, faults = 0, None, False, Counter[str]()
+    with open_container() as container:
         track = container.streams.audio[number]
         rate = int(track.rate)
         if track.duration and track.time_base:
             _check_length(name, float(track.duration * track.time_base), limit)
         for frame in container.decode(track):
-            samples, channels = _scaled(frame.to_ndarray()), frame.layout.nb_channels
+            samples, channels = _to_full_scale(frame.to_ndarray()), frame.layout.nb_channels
             block = samples.T if frame.format.is_planar else samples.reshape(-1, channels)
             if frame.time is not None:
                 start = _first_time(container, frame.time) if start is None else start
@@ -380,7 +380,7 @@ def _track(
                         f"{name}: its sound stops at {done / rate:.1f} s and goes on {ahead / rate:.0f} s later; "
                         f"cut it there, or convert it to .wav"
                     )
-                if not aligned or abs(ahead) > HOLE * rate:  # what follows stays in step with the pictures
+                if not in_step or abs(ahead) > HOLE * rate:  # what follows stays in step with the pictures
                     _check_length(name, (done + ahead) / rate, limit)
                     if ahead > HOLE * rate:
                         faults["are missing by its times, and are silence"] += ahead
@@ -390,7 +390,7 @@ def _track(
                         yield np.zeros((ahead, channels), np.float32)
                         done += ahead
                     block = block[max(0, -ahead) :]
-                    aligned = len(block) > 0
+                    in_step = len(block) > 0
             done += len(block)
             yield block
             _check_length(name, done / rate, limit)
@@ -548,11 +548,11 @@ def waveform(samples: Waveform, name: str) -> Samples:
             f"{name}: is {array.dtype} of shape {array.shape}; expected samples (S,) or (S, channels) in floating "
             f"point, int16, int32 or uint8, or the path of a recording"
         )
-    samples = _scaled(array)
+    samples = _to_full_scale(array)
     return samples.T if samples.ndim == 2 and samples.shape[0] < samples.shape[1] else samples
 
 
-def _scaled(array: npt.NDArray[Any]) -> Samples:
+def _to_full_scale(array: npt.NDArray[Any]) -> Samples:
     """Samples of any shape with a full scale of 1; floating point as it is."""
     with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is refused
         if array.dtype.name not in FULL_SCALE:
@@ -571,11 +571,10 @@ def stream_piece(chunk: Waveform | bytes) -> npt.NDArray[np.float32]:
     if not len(samples):
         return np.zeros(0, np.float32)
     piece = waveform(samples, "chunks")
-    if (
-        peak := float(np.abs(piece).max())
-    ) > LOUD and peak <= LOUDEST:  # of the whole stream's scale a piece tells nothing
+    peak = float(np.abs(piece).max())
+    if WHOLE_NUMBERS < peak <= LOUDEST:  # a piece does not tell the scale of the whole stream
         raise FaceDiffError(f"chunks: one reaches {peak:g}; expected floating point with a full scale of 1, or int16")
-    return _checked(piece, "chunks") if not peak <= LOUDEST else piece
+    return piece if peak <= LOUDEST else _checked(piece, "chunks").astype(np.float32)
 
 
 # Decoders return the samples that they find, and only some of them say that there should be more. A recording that was
@@ -604,7 +603,7 @@ def cut_short(source: Path | IO[bytes]) -> str | None:
     Wav, AIFF, MP4 and Ogg are checked, by their headers only; others, such as flac, are left to the decoder. Of an mp3
     nothing tells how long it should be.
     """
-    with _opened(source, str(source)) as stream, _mapped(stream) as data:
+    with _open_stream(source, str(source)) as stream, _map_content(stream) as data:
         head = data[:12]
         if head[:4] in (b"RIFF", b"RF64", b"BW64") and head[8:] == b"WAVE":
             return _chunks(data, "<4sI", b"data")
@@ -618,7 +617,7 @@ def cut_short(source: Path | IO[bytes]) -> str | None:
 
 
 @contextmanager
-def _mapped(stream: IO[bytes]) -> Iterator[mmap.mmap | bytes]:
+def _map_content(stream: IO[bytes]) -> Iterator[mmap.mmap | bytes]:
     """The content of an open file."""
     try:
         data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from facediff.errors import counted, damaged, note
 from facediff.speech.text_grids import SILENCES, phones_in
-from facediff.utils.paths import existing
+from facediff.utils.paths import find_file
 from facediff.utils.plain_files import read_rows
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def phonemes_text(phonemes: Iterable[TimedPhoneme]) -> str:
 
 def phonemes_file(corpus: Path | None, clip: str) -> Path | None:
     """Where a corpus has a clip's phonemes; None if it has none."""
-    path = None if corpus is None else existing(corpus / "phonemes" / f"{clip}.csv")
+    path = None if corpus is None else find_file(corpus / "phonemes" / f"{clip}.csv")
     return path if path is not None and path.is_file() else None
 
 
@@ -114,15 +114,15 @@ def closing(labels: Sequence[str]) -> list[str | None]:
         (['p', None, 'm'], ['p', None, 'p', 'm'])
     """
     plain = [_PLACE.sub("", label.strip().strip(_MARKS)) for label in labels]
-    sounding = [label for label in plain if label.lower() not in SILENCES]
-    is_arpabet = any(_STRESSED.fullmatch(label) for label in sounding) or not any(
-        character.islower() for label in sounding for character in label
+    sounds = [label for label in plain if label.lower() not in SILENCES]
+    is_arpabet = any(_VOWEL.fullmatch(label) for label in sounds) or not any(
+        character.islower() for label in sounds for character in label
     )
     return [_closing(label.lower() if is_arpabet else label) for label in plain]
 
 
 _PLACE = re.compile(r"_[BIES]$")  # in the word, of Kaldi's phones
-_STRESSED = re.compile(r"[A-Z]{2}[012]")  # a vowel of the ARPAbet
+_VOWEL = re.compile(r"[A-Z]{2}[012]")  # a vowel of the ARPAbet
 _MARKS = f"/[](){{}}\"%'{STRESS}"  # brackets, and stress in the IPA and X-SAMPA
 _DIACRITICS = re.compile(r"_[^pb]|[_=~:'`^<>?0-9-]")  # of X-SAMPA; k_p is tied
 _OTHER_NAMES = {"pcl": "p", "bcl": "b", "em": "m", "ɓ": "b", "ʙ": "b", "ʘ": "p", "b_<": "b", "B\\": "b"}
@@ -185,7 +185,7 @@ def read_alignment(path: Path) -> list[TimedPhoneme]:
         phonemes = read_phonemes(path)
     labels = ["" if phoneme.ipa.strip().lower() in SILENCES else phoneme.ipa.strip() for phoneme in phonemes]
     closed = closing(labels)
-    count, sounding = sum(name is not None for name in closed), sum(map(bool, labels))
+    count, total = sum(name is not None for name in closed), sum(map(bool, labels))
     remedy = "" if count else "; expected p, b and m of the IPA, X-SAMPA or the ARPAbet"
-    note(f"{path}: {count} of {counted(sounding, 'label')} close the lips{remedy}")
+    note(f"{path}: {count} of {counted(total, 'label')} close the lips{remedy}")
     return [replace(phoneme, ipa=name or label) for phoneme, name, label in zip(phonemes, closed, labels, strict=True)]

@@ -21,7 +21,7 @@ from facediff.evaluation.file_pairs import DEFAULT_PATTERNS, OWN, NamePattern
 from facediff.mesh import read_mesh
 from facediff.speech.audio import CONTAINERS, SUFFIXES, read_sound_to_play
 from facediff.study.design import STILL, TRUTH
-from facediff.utils.paths import existing, name_of_file
+from facediff.utils.paths import find_file, name_of_file
 
 ANIMATIONS = (".npz", ".npy")
 UNEQUAL = 0.1
@@ -190,7 +190,7 @@ class StudyAnimations:
         for clip, found_truth in corpus.truths.items():
             self._subjects[clip] = found_truth.name.subject
             if self.speech is None and corpus.corpus is not None:
-                sound = existing(corpus.corpus / "wav" / f"{found_truth.path.stem}.wav")
+                sound = find_file(corpus.corpus / "wav" / f"{found_truth.path.stem}.wav")
                 if sound.is_file():
                     self._sounds[clip] = sound
         return {

@@ -30,17 +30,17 @@ def from_home(value: Value) -> Value:
 # composed one, which is the form of every name here.
 
 
-def composed(name: str) -> str:
+def compose(name: str) -> str:
     """A name in the composed form."""
     return unicodedata.normalize("NFC", name)
 
 
 def name_of_file(path: Path) -> str:
     """A file's name without its suffix, in the composed form."""
-    return composed(path.stem)
+    return compose(path.stem)
 
 
-def existing(path: Path) -> Path:
+def find_file(path: Path) -> Path:
     """The file of this name in either form; the path itself where there is none."""
     forms = (path, *(path.with_name(unicodedata.normalize(form, path.name)) for form in ("NFC", "NFD")))
     return next((form for form in forms if form.exists()), path)

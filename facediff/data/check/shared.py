@@ -16,7 +16,7 @@ from facediff.data.check.layouts import MANIFEST, STATE, CorpusView
 from facediff.errors import counted, number
 from facediff.mesh.mesh import surface_area
 from facediff.utils.checksums import sha256
-from facediff.utils.paths import composed
+from facediff.utils.paths import compose
 
 if TYPE_CHECKING:
     from facediff.data.corpus import Corpus
@@ -104,8 +104,8 @@ def check_templates(root: Path, view: CorpusView, findings: Findings) -> tuple[d
         section["file"] = path.name
         for subject, value in loaded.items():
             with findings.guard("template_broken", path, root):
-                templates[composed(str(subject))] = as_template(path, subject, value, view.n_vertices)
-        section["broken"] = sorted({composed(str(subject)) for subject in loaded} - templates.keys())
+                templates[compose(str(subject))] = as_template(path, subject, value, view.n_vertices)
+        section["broken"] = sorted({compose(str(subject)) for subject in loaded} - templates.keys())
         section["subjects"] = sorted(templates)
         content = path.read_bytes()
         # Git's name for the file's content, by which a file in a repository can be found.

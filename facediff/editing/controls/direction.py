@@ -23,7 +23,7 @@ from facediff.spaces.arkit import ARKIT, LEFT_AND_RIGHT
 from facediff.utils import ranges
 from facediff.utils.hints import Range, check_number, shown
 from facediff.utils.limits import FRAME_RATES, check_format, quoted
-from facediff.utils.paths import existing, from_home
+from facediff.utils.paths import find_file, from_home
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_columns, write_json, write_rows
 from facediff.utils.records import read_record
 
@@ -371,7 +371,7 @@ def direction_file(folder: Path, recording: Path) -> Path | None:
     """The file of a folder that has the keys for a recording: ``NAME.direction.json``, ``NAME.json`` or ``.csv``."""
     for name in (f"{recording.stem}.direction", recording.stem):
         for suffix in (".json", ".csv"):
-            if (path := existing(folder / f"{name}{suffix}")).is_file():
+            if (path := find_file(folder / f"{name}{suffix}")).is_file():
                 return path
     return None
 

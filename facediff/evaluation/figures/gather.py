@@ -23,7 +23,7 @@ from facediff.mesh.mesh_files import SUFFIXES, read_mesh
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import TimedPhoneme, phonemes_file, read_phonemes
 from facediff.utils import ranges
-from facediff.utils.paths import existing
+from facediff.utils.paths import find_file
 
 
 @ranges.checked
@@ -92,7 +92,7 @@ def gather(
 def sound_of(material: FigureData, clip: str, file: Path | None = None) -> npt.NDArray[np.float32] | None:
     """Speech (S,) of a clip at 16 kHz: from the file given, else the corpus's; None if there is none."""
     if file is None and material.corpus is not None:
-        file = existing(material.corpus / "wav" / f"{material.truths[clip].path.stem}.wav")
+        file = find_file(material.corpus / "wav" / f"{material.truths[clip].path.stem}.wav")
         file = file if file.is_file() else None
     return None if file is None else read_speech(file)
 

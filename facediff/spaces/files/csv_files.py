@@ -26,7 +26,7 @@ TIMECODE, COUNT = "Timecode", "BlendShapeCount"
 REMEDY = "expected a table as Live Link Face or Audio2Face writes it"
 SIXTIETHS = 60
 """Unit of the last field of a timecode, as parts of a second; it does not depend on the recorded rate."""
-COUNTED = (24, 25, 30, 48, 50)
+TIMECODE_RATES = (24, 25, 30, 48, 50)
 """Frames a second that programs count in that field."""
 USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
 NEAR_RATE = 0.01
@@ -87,7 +87,9 @@ def _clock(path: Path, stamps: Array) -> Array:
         after = np.diff(parts)
         # A program may drop rows, also where a second ends.
         turn = float(np.median(after[steps == 0])) - float(np.median(after[steps == 1]))
-        unit = next((rate for rate in COUNTED if rate > np.floor(parts.max()) and abs(rate - turn) < 0.5), SIXTIETHS)
+        unit = next(
+            (rate for rate in TIMECODE_RATES if rate > np.floor(parts.max()) and abs(rate - turn) < 0.5), SIXTIETHS
+        )
     if unit != SIXTIETHS:
         note(f"{path}: the last field of its timecodes counts frames, {unit} a second")
         parts = np.floor(parts)
