@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import CHUNK, Flame, FlameArrays, read_flame_arrays, rotations
@@ -138,18 +136,6 @@ def test_a_long_clip_is_the_same_frame_by_frame() -> None:
     alone = [model.vertices(shape, expression[t : t + 1], jaw[t : t + 1])[0] for t in range(frames)]
     np.testing.assert_allclose(together, alone, atol=1e-14)
     assert model.vertices(shape, expression[:0], jaw[:0]).shape == (0, 16, 3)
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.lists(st.floats(-6, 6), min_size=3, max_size=3))
-def test_rotations_are_rotations(vector: list[float]) -> None:
-    axis = np.array(vector)
-    (turn,) = rotations(axis[None])
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turn) == pytest.approx(1)
-    np.testing.assert_allclose(turn @ axis, axis, atol=1e-11)
-    np.testing.assert_allclose(np.trace(turn), 1 + 2 * np.cos(np.linalg.norm(axis)), atol=1e-12)
-    np.testing.assert_allclose(turn, turn_by_definition(axis), atol=1e-9)
 
 
 def test_tiny_rotations_are_exact() -> None:

@@ -111,20 +111,6 @@ def test_guidance_on_preconditioned_components_is_the_formula(ready: Ready, tiny
     torch.testing.assert_close(found[1.6], found[0.0] + 1.6 * (found[1.0] - found[0.0]), rtol=0, atol=1e-4)
 
 
-def test_guidance_of_one_changes_nothing(ready: Ready, batch: Batch) -> None:
-    """Bit for bit, with the weights of a model that knows no guidance."""
-    model, plain = ready(), ready(speech_dropout=0, style_dropout=0)
-    missing = plain.load_state_dict(model.state_dict(), strict=False)
-    assert set(missing.unexpected_keys) == {"network.no_speech", "network.no_style"}
-    assert not missing.missing_keys
-    expected = plain.generate(batch, seed=3)
-    assert torch.equal(model.generate(batch, seed=3), expected)
-    model.choose_guidance({"style": 1.5, "speech": 1.2})
-    assert not torch.equal(model.generate(batch, seed=3), expected)
-    model.choose_guidance({"style": 1.0, "speech": 1.0})
-    assert torch.equal(model.generate(batch, seed=3), expected)
-
-
 def test_guided_clips_samples_and_streams_agree(ready: Ready, tiny: Tiny, batch: Batch) -> None:
     model = ready(style_guidance=1.8, speech_guidance=1.3)
     alone = model.generate(collate([tiny.dataset("train")[0]]), seed=2)[0]

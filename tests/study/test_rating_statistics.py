@@ -61,15 +61,6 @@ def test_bradley_terry_scores_maximise_the_likelihood() -> None:
     assert not found.robust  # eight raters
 
 
-def test_two_conditions_are_a_logit_with_its_usual_variance() -> None:
-    wins = np.array([[[0.0, 30.0], [12.0, 0.0]]])
-    found = bradley_terry(wins)
-    lead = np.array([1.0, -1.0])
-    assert found.scores @ lead == pytest.approx(math.log(30 / 12))
-    assert lead @ found.covariance @ lead == pytest.approx(1 / 30 + 1 / 12)
-    assert found.covariance.sum() == pytest.approx(0, abs=1e-12)
-
-
 def test_intervals_of_scores_cover_raters_who_differ() -> None:
     """Answers of one rater are alike here; intervals that take them as independent cover far less."""
     rng = np.random.default_rng(1)

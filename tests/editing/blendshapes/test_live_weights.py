@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import lsq_linear, nnls
+from scipy.optimize import lsq_linear
 
 from facediff.animation import Animation
 from facediff.editing.blendshapes import SolveOptions, solve, vertex_areas
@@ -67,14 +67,6 @@ def test_weights_are_those_of_an_independent_solver(options: SolveOptions) -> No
         np.testing.assert_allclose(solver.solve(offsets), goal, atol=1e-6)
 
 
-def test_weights_without_an_upper_bound_are_those_of_nonnegative_least_squares() -> None:
-    shapes = some_shapes(seed=3)
-    basis = shapes.deltas.reshape(len(shapes.names), -1).T
-    solver = FrameSolver(shapes, 30.0, options=replace(NO_PRIOR, upper=1000.0))
-    for offsets in some_motion(shapes, frames=10):
-        np.testing.assert_allclose(solver.solve(offsets), nnls(basis, offsets.ravel())[0], atol=1e-6)
-
-
 def test_a_frame_is_held_near_the_last_one_by_the_stated_strength() -> None:
     """With areas, ridge, symmetry and a frame rate, against the same least squares written out as rows."""
     shapes = some_shapes(4)
@@ -131,12 +123,6 @@ def test_a_shape_that_gains_too_little_stays_at_zero_and_fades_as_offline() -> N
     assert first[1] > 0.7
     assert (first[2:4] > 0.01).all()  # 1/15 s are two frames
     assert (first[4:] == 0).all()
-
-
-def test_bounds_of_both_signs_with_sparsity() -> None:
-    shapes = some_shapes()
-    solver = FrameSolver(shapes, 30.0, options=SolveOptions(smoothness=0.0, lower=-1.0))
-    assert solver.solve(-0.5 * shapes.deltas[3])[3] == pytest.approx(-0.5, abs=1e-3)
 
 
 def test_shapes_without_effect_keep_weight_zero_and_what_is_left_is_measured() -> None:
