@@ -50,15 +50,16 @@ void main() {
   light += lamp(dot(normal, vec3(-0.482, 0.525, 0.701)), vec3(0.80, 0.76, 0.70), vec3(0.37, 0.27, 0.25));
   light += lamp(dot(normal, vec3(0.816, 0.048, 0.576)), vec3(0.14, 0.17, 0.22), vec3(0.62, 0.52, 0.5));
   light += max(dot(normal, vec3(0.724, 0.434, -0.531)), 0.0) * vec3(0.22, 0.23, 0.26);
-  float shine = max(dot(normal, vec3(-0.261, 0.285, 0.922)), 0.0); // half way between key light and viewer
+  // Half way between key light and viewer.
+  float shine = max(dot(normal, vec3(-0.261, 0.285, 0.922)), 0.0);
   shine *= shine; // 2
   float wide = shine * shine; // 4
   wide *= wide; // 8
   wide *= wide; // 16
   float narrow = wide * wide; // 32
   vec3 lit = open * (albedo * light + 0.096 * wide * shine + 0.064 * narrow * narrow);
-  // Backs are dark: warm behind skin, as the hollow of a mouth, and without a tint behind hair.
-  if (!gl_FrontFacing) lit = mix(albedo * vec3(0.12, 0.04, 0.035), lit, 0.18);
+  // Backs are dark: warm behind skin, as the hollow of a mouth, and hardly tinted behind hair of any colour.
+  if (!gl_FrontFacing) lit = mix(albedo.b * (albedo.r - albedo.b) * vec3(0.6, 0.13, 0.09), lit, 0.18);
   colour = vec4(sqrt(lit), 1.0);
 }`;
 
