@@ -169,11 +169,15 @@ def check_entry(name: str, output: Path) -> Path:
 
 
 def read_entry_speech(path: Path) -> Speech:
-    """The speech of a video or a sound file; silence is refused."""
+    """The speech of a video or a sound file; silence is refused.
+
+    16-bit sound ends at full scale: a recording that goes beyond is turned down as a whole.
+    """
     speech = read_speech(path)
-    if float(np.abs(speech).max(initial=0.0)) < SILENCE:
+    loudest = float(np.abs(speech).max(initial=0.0))
+    if loudest < SILENCE:
         raise FaceDiffError(f"{path}: holds only silence; expected the speech of the video")
-    return speech
+    return speech / np.float32(max(1.0, loudest))
 
 
 def _check_lengths(motion: Path, audio: Path, samples: int, frames: int, frame_rate: float) -> list[str]:
@@ -374,8 +378,6 @@ def _write_entry(
     report: ImportReport,
 ) -> None:
     """Write clips, template and manifest in the layout that every corpus has."""
-    # 16-bit sound ends at full scale: a recording that goes beyond is turned down as a whole.
-    speech = speech / max(1.0, float(np.abs(speech).max(initial=0.0)))
     for clip in clips:
         first = samples_for(clip.start, target.frame_rate)
         part = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)

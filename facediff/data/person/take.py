@@ -187,8 +187,6 @@ def import_take(
 
 def _write(folder: Path, clip: ParameterClip, speech: Speech, entries: list[EntryClip], report: TakeReport) -> None:
     (folder / FOLDER).mkdir(parents=True)
-    # 16-bit sound ends at full scale: a recording that goes beyond is turned down as a whole.
-    speech = speech / max(1.0, float(np.abs(speech).max(initial=0.0)))
     for entry in entries:
         part = replace(clip, name=entry.name, values=clip.values[entry.start : entry.stop], start=0.0)
         write_live_link(folder / FOLDER / f"{entry.name}.csv", part)

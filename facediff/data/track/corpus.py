@@ -337,9 +337,8 @@ class PeopleWriter:
         vertices = scale * faces[:, :POINTS]
         speech = recording.speech[round(grid[0] * SAMPLE_RATE) :]
         speech = fit_length(speech, samples_for(len(faces), rate))
-        write_clip(self.out, clip, vertices, speech / max(1.0, float(np.abs(speech).max())))
+        write_clip(self.out, clip, vertices, speech)
         for folder, values in zip(CHANNELS, (angles, gaze, confidence), strict=True):
-            (self.out / folder).mkdir(exist_ok=True)
             with atomic(self.out / folder / f"{clip}.npy") as temporary:
                 np.save(temporary, values.astype(np.float32))
         steps = np.linalg.norm(np.diff(vertices, axis=0, prepend=vertices[:1]), axis=-1).mean(axis=-1)
@@ -377,11 +376,8 @@ class PeopleWriter:
         write_mesh(self.out / MESH, METRES * MILLIMETRES * self.model.canonical, self.triangles)
         regions = {"lve": LIPS, "fdd": UPPER_FACE, "inner_lip_pairs": LIP_PAIRS, "eyelid_pairs": EYELID_PAIRS}
         for name, entries in regions.items():
-            file = self.out / "regions" / f"{name}.txt"
-            file.parent.mkdir(exist_ok=True)
-            lines = (" ".join(map(str, entry)) if isinstance(entry, tuple) else str(entry) for entry in entries)
-            with atomic(file) as temporary:
-                temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            with atomic(self.out / "regions" / f"{name}.txt") as temporary:
+                np.savetxt(temporary, entries, "%d")
         write_rows(self.out / "clips.csv", [self.rows[name] for name in sorted(self.rows)], line_end="\n")
         terms, frame_rate = self.options.licence, self.options.frame_rate
         commercial = "allowed" if self.options.commercial else KNOWN.get(terms.casefold(), "unknown")

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.track.face import MILLIMETRES, PosedFaces, pair_distances, pose
+from facediff.data.person.importer import MIN_SECONDS, read_entry_speech
+from facediff.data.track.face import MILLIMETRES, PosedFaces, pose
 from facediff.data.track.model import FaceModel, read_face_model
 from facediff.data.track.options import TrackingOptions
 from facediff.data.track.tracker import FaceTracker
 from facediff.data.track.video import Picture, read_pictures
 from facediff.errors import FaceDiffError
-from facediff.speech.audio import read_speech
 from facediff.utils.arrays import ArrayWriter, open_array, read_arrays
 from facediff.utils.batch import FileTask
 from facediff.utils.files import atomic
@@ -28,7 +28,6 @@ Array = npt.NDArray[np.float64]
 
 LANDMARKS = 478
 BLOCK = 256  # frames that are posed at a time
-SILENCE = 1e-4  # of a sample: below it a recording is silent
 MOST_MISSED = 0.2  # share of frames without a face
 MOST_TURNED, TURNED = 0.1, 35.0  # share of frames, degrees
 OTHERS_SEEN = 0.2  # share of the checks that may show a second face
@@ -37,7 +36,6 @@ SCALE_JUMP, CENTRE_JUMP, SHAPE_JUMP = 0.06, 0.5, 2.5
 """Steps from frame to frame at which the video is cut: of the face's scale, of its centre in widths of a face, and of
 the face without lips in millimetres, which is another person."""
 FACE_WIDTH = 150.0  # millimetres
-MIN_SECONDS = 2.0
 STILL_POINTS = (6, 168, 197, 195, 5, 4, 33, 133, 362, 263, 127, 356, 234, 454, 10, 151)
 """Points of the nose, the corners of the eyes and the outline above the mouth."""
 
@@ -58,9 +56,7 @@ def landmark_file(output: Path) -> Path:
 
 def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[Path]:
     """Write the landmarks of a video, frame by frame, then times, presence, sound and counts."""
-    speech = read_speech(task.source)
-    if float(np.abs(speech).max()) < SILENCE:
-        raise FaceDiffError(f"{task.source}: holds only silence; expected a video of a person who speaks")
+    speech = read_entry_speech(task.source)
     face = {None: "largest", "left": "1"}.get(options.face, options.face) or "largest"
     tracker = FaceTracker(model, face, options.min_face)
     times: list[float] = []
@@ -139,13 +135,11 @@ class RecordingSummary:
     Attributes:
         parts: first frame, and frame after the last, of the parts without cuts and long gaps.
         face_pixels: median width of the face.
-        gaps: (T,) between the lips in millimetres; NaN where no face was seen.
         sample: (N, 478, 3) landmarks of frames evenly spread over the parts.
     """
 
     parts: list[tuple[int, int]]
     face_pixels: float
-    gaps: Array
     sample: npt.NDArray[np.float32]
 
 
@@ -167,7 +161,6 @@ def summarise(recording: Recording, model: FaceModel, sample_size: int) -> Recor
             f"{source}: the head is turned by more than {TURNED:g}° in {turned:.0%} of the frames; expected a face "
             f"that looks towards the camera"
         )
-    gaps = np.concatenate([pair_distances(block.faces) for block in blocks])
     still = np.concatenate([block.faces[:, STILL_POINTS] for block in blocks])
     frames = np.flatnonzero(np.isfinite(scales))
     steps = np.diff(frames)
@@ -188,4 +181,4 @@ def summarise(recording: Recording, model: FaceModel, sample_size: int) -> Recor
         )
     usable = np.concatenate([frames[(frames >= a) & (frames < b)] for a, b in parts])
     picks = usable[np.linspace(0, len(usable) - 1, min(sample_size, len(usable))).astype(int)]
-    return RecordingSummary(parts, float(np.median(widths)), gaps, np.asarray(recording.landmarks[picks]))
+    return RecordingSummary(parts, float(np.median(widths)), np.asarray(recording.landmarks[picks]))

@@ -24,7 +24,6 @@ MARGIN = 1.5  # side of the region round a face, in sides of its box
 SCORE = 0.5  # least score of a detection
 OVERLAP = 0.3  # two boxes that share more than this part of their union are one face
 EYES = (33, 263)  # outer corners of the right and left eye
-LEVELS = 3  # sizes of the squares in which faces are looked for: the picture, its shorter side, half of that
 
 
 def anchor_centres() -> Array:
@@ -159,7 +158,7 @@ class FaceTracker:
         """All faces of a picture: in the whole of it or, where it shows none, in smaller squares."""
         height, width = picture.shape[:2]
         sides = [max(height, width), min(height, width), min(height, width) / 2]
-        for side in sides[:LEVELS]:
+        for side in sides:
             corners = [(x, y) for y in steps(height, side) for x in steps(width, side)]
             detections = sorted(
                 (face for corner in corners for face in self._detect(picture, corner, side)),
