@@ -117,6 +117,11 @@ def person(
     with resumable(output):
         tracked = track_people(videos, root, tracking, workers=None, progress=not quiet)
         tell(*tracked.lines(), *sync_warnings(root, videos))
+        if tracked.people[0].clips == 1:
+            raise FaceDiffError(
+                f"{video}: gives a single clip, and training needs two; expected a minute of video (or, in another "
+                f"--corpus, a smaller --clip-seconds)"
+            )
         if not check(root, None, progress=not quiet).sound:
             raise FaceDiffError(f"{root}: is not sound; `facediff data check {root}` says why")
         data = People(root=str(root))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import facediff
 from facediff.cli.app import main
 from facediff.data import People
 from facediff.data.corpus import read_clip_table, read_templates
@@ -165,6 +166,30 @@ def test_noise_of_the_brows_is_a_warning(
     monkeypatch.setattr(CodedTracker, "landmarks", trembling)
     assert track(write_coded_video(tmp_path / "eva.mp4", pictures(talking(4))), tmp_path / "people") == 0
     assert "the motion of the brows is mostly noise (difference ratio 1.7" in capsys.readouterr().out
+
+
+def test_a_video_becomes_a_speaker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_coded_video(tmp_path / "eva.mp4", pictures(talking(10)))
+    words = ["person", "eva.mp4", "-o", "eva.ckpt", "--clip-seconds", "2", "--quiet", "--steps"]
+    assert main([*words, "2"]) == 0
+    model = facediff.load("eva.ckpt")
+    assert (model.identities, model.corpus) == (["eva"], "people")
+    times = np.arange(16_000) / 16_000
+    speech = (0.3 * np.sin(2000 * times) * np.sin(9 * times)).astype(np.float32)
+    before = model.animate(speech, 16_000, seed=0)
+    assert before.vertices.shape == (25, 468, 3)
+    assert np.isfinite(before.vertices).all()
+    monkeypatch.setattr("facediff.data.track.recording.FaceTracker", None)  # tracks are there already
+    assert main([*words, "4"]) == 0  # goes on
+    assert not np.array_equal(facediff.load("eva.ckpt").animate(speech, 16_000, seed=0).vertices, before.vertices)
+
+
+def test_a_model_needs_two_clips(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(4)))
+    assert main(["person", str(video), "-o", str(tmp_path / "eva.ckpt"), "--quiet"]) == 2
+    assert "eva.mp4: gives a single clip, and training needs two" in capsys.readouterr().err
+    assert not (tmp_path / "eva.ckpt").exists()
 
 
 def test_one_of_several_faces_is_chosen(tmp_path: Path) -> None:
