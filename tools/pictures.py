@@ -121,7 +121,7 @@ PICTURES: dict[str, tuple[str, ...]] = {
     "study_wide.png": (*STUDY, f"{RATING} --width 1200 --height 760"),
     "talking_face.webp": (
         *TRUTH,
-        "facediff export truth.npz facediff.npz -o both.mp4",
+        "facediff export truth.npz facediff.npz --size 512 -o both.mp4",
         "python {root}/tools/moving_picture.py both.mp4 {picture}",
     ),
     "viewer_direction.png": (
