@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,7 @@ class Mp4(Format):
 
     next_step = "any player shows it"
     holds_several = True
-    speech = "in the file"
+    speech: ClassVar[Literal["in the file", "next to it", "none"]] = "in the file"
     units = "none"
     up_axes = ()
     uses = ("view", "size", "video_rate")

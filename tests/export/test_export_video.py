@@ -10,7 +10,7 @@ import av
 import numpy as np
 import numpy.typing as npt
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from facediff.animation import Animation
 from facediff.export import ExportOptions, video, write_animations
@@ -44,10 +44,7 @@ def test_a_video_for_web_pages_has_speech_and_a_moving_picture_has_none(animatio
         assert sum(1 for _ in container.decode(video=0)) == 40
     assert write_animations(tmp_path / "a.gif", [animation], replace(SMALL, size=192)) == [tmp_path / "a.gif"]
     with Image.open(tmp_path / "a.gif") as picture:
-        lengths = []
-        for index in range(picture.n_frames):
-            picture.seek(index)
-            lengths.append(picture.info["duration"])
+        lengths = [frame.info["duration"] for frame in ImageSequence.Iterator(picture)]
         assert picture.width == 64
     assert sum(lengths) == pytest.approx(1000 * 40 / 30, abs=5)
 
