@@ -164,7 +164,7 @@ def sync_warnings(root: Path, people: Iterable[str]) -> Iterator[str]:
             frames = np.load(file, mmap_mode="r")
             gaps = pair_distances(frames.reshape(len(frames), -1, 3), pairs)
             animation = model.animate(read_speech(root / "wav" / f"{file.stem}.wav"), SAMPLE_RATE, seed=0)
-            expected = pair_distances(animation.vertices, animation.inner_lip_pairs)
+            expected = pair_distances(animation.vertices, np.asarray(animation.inner_lip_pairs))
             times = np.arange(len(expected)) / model.frame_rate
             scores.append(correlations(np.interp(times, np.arange(len(gaps)) / rate, gaps), expected, LAGS, 2 * LAGS))
         mean = np.mean(scores, axis=0)

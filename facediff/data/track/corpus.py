@@ -377,7 +377,7 @@ class PeopleWriter:
         regions = {"lve": LIPS, "fdd": UPPER_FACE, "inner_lip_pairs": LIP_PAIRS, "eyelid_pairs": EYELID_PAIRS}
         for name, entries in regions.items():
             with atomic(self.out / "regions" / f"{name}.txt") as temporary:
-                np.savetxt(temporary, entries, "%d")
+                np.savetxt(temporary, np.asarray(entries), "%d")
         write_rows(self.out / "clips.csv", [self.rows[name] for name in sorted(self.rows)], line_end="\n")
         terms, frame_rate = self.options.licence, self.options.frame_rate
         commercial = "allowed" if self.options.commercial else KNOWN.get(terms.casefold(), "unknown")

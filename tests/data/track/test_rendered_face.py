@@ -8,18 +8,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from numpy.typing import ArrayLike
 
+import facediff
 from facediff.data import Puppet
 from facediff.data.track.corpus import track_people
 from facediff.data.track.face import pair_distances
+from facediff.data.track.model import read_face_model
 from facediff.data.track.options import VARIABLE, TrackingOptions
-from facediff.data.track.topology import EYELID_PAIRS, LIP_PAIRS
+from facediff.data.track.topology import EYELID_PAIRS, LIP_PAIRS, without_webs
+from facediff.data.track.tracker import FaceTracker
 from facediff.editing.landmarks import puppet_landmarks
+from facediff.export import ExportOptions
+from facediff.export.video import drawn_frames
 from facediff.render import Camera, Renderer, portrait, write_video
 from facediff.spaces.rotations import convert, matrices
 from facediff.speech.audio import read_speech
 from facediff.synthetic import corpus as puppet
+from facediff.utils.files import example_recordings
 
 pytestmark = [
     pytest.mark.slow,
@@ -129,3 +136,32 @@ def test_a_small_picture_still_shows_closures(truth: Puppet, tmp_path: Path) -> 
     pairs = measure(truth, tmp_path, 160)
     assert correlation(pairs["gap"]) >= 0.7
     assert area_under_curve(pairs["gap"]) >= 0.8
+
+
+def test_bars_turns_and_neighbours_do_not_move_the_landmarks() -> None:
+    model = read_face_model(Path(os.environ[VARIABLE]))
+    spoken = facediff.load("puppet").animate(example_recordings()[0], seed=0)
+    (picture,) = drawn_frames([spoken.part([40])], ExportOptions(size=384))
+    found = [
+        FaceTracker(model, face).landmarks(np.ascontiguousarray(seen))
+        for face, seen in (
+            ("1", picture),
+            ("1", np.pad(picture, ((80, 80), (0, 0), (0, 0)))),
+            ("2", np.concatenate([picture, picture], axis=1)),
+            ("1", np.rot90(picture)),
+        )
+    ]
+    points, barred, second, turned = (result[0][:, :2] for result in found if result is not None)
+    upright = np.stack([383 - turned[:, 1], turned[:, 0]], axis=1)
+    errors = [np.linalg.norm(seen - points, axis=1).mean() for seen in (barred - (0, 80), second - (384, 0), upright)]
+    assert max(errors) < 1, errors  # pixels of a face of 170
+
+
+def test_mouth_and_eyes_are_open() -> None:
+    triangles = without_webs(read_face_model(Path(os.environ[VARIABLE])).triangles)
+    assert len(triangles) == 852
+    edges, counts = np.unique(
+        np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0, return_counts=True
+    )
+    rims = trimesh.graph.connected_components(edges[counts == 1], min_len=3)
+    assert len(rims) == 4  # of the mask, the mouth and the eyes
