@@ -9,11 +9,11 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
   share with the closures moved to every other time of the clip. *Within 1 mm* and *gap*: how far the lips' pairs are
   apart at their nearest in a closure, compared with the neutral face, in mm.
 - *kept out*: the clips of test C, whose voices nobody is trained with, by voice.
-- *people kept out*: all test sentences and 48 others by voices of people that nobody is trained with, as far as they
-  are installed, each with two seeds; ± is half of the 95 % interval where the sentences are drawn again. ``--people``
-  names other voices.
-- *recordings*: people's own, with their words in NAME.txt (``--recordings FOLDER``). Times of p, b and m come from
-  `--transcript`'s alignment and are a few hundredths of a second off: a closure may be a frame early or late.
+- *people kept out*: articulation (facediff/evaluation/articulation.py) in all test sentences and 48 others by voices of
+  people that nobody is trained with, as far as they are installed, each with two seeds; means over sentences, and half
+  of the 95 % interval of the AUC. ``--people`` names other voices.
+- *recordings*: the same of people's own, in a folder of `facediff data align` (``--recordings FOLDER``); means over
+  speakers.
 - *pauses*: two sentences with 1 s of silence before, between and after them. How far the lips are open in the pauses,
   from 0.3 s after speech to 0.2 s before it, how far a lip vertex moves from a frame to the next, and the lip vertex
   error of the first 0.2 s of speech, which a gate that opens late would raise.
@@ -30,7 +30,7 @@ import argparse
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
-from itertools import cycle, product
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +44,13 @@ import facediff
 from facediff.animation.options import GROUPS
 from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
-from facediff.editing.transcripts import align_transcript
-from facediff.reporting.statistics import Bootstrap
-from facediff.speech.audio import fit_length, read_speech
+from facediff.evaluation.articulation import MouthMotion, by_speaker, mouth_motion
+from facediff.speech.audio import fit_length
+from facediff.speech.espeak import Utterance
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
 from facediff.speech.pitch import HOP, SIZE, signal, spectra
 from facediff.synthetic.cast import KEPT_OUT_PEOPLE
+from facediff.synthetic.recordings import recordings_of, speakers_of
 from facediff.synthetic.sentences import TEST
 from facediff.synthetic.voices import installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
@@ -351,49 +352,42 @@ class Bench:
         return {**_closed(closures, chances, gaps), "LVE / still": float(errors.mean() / np.concatenate(still).mean())}
 
     def person(self, voice: str) -> dict[str, float]:
-        """Closures of sentences in a voice without clips."""
+        """Articulation of sentences in a voice without clips."""
         said = map(open_voice(voice).speak, (*TEST, *FURTHER))
-        return self.strangers(
-            ((each.samples, [TimedPhoneme(*astuple(phoneme)) for phoneme in each.phonemes]) for each in said), DRAWS
-        )
+        return self.strangers(((str(n), each) for n, each in enumerate(said)), DRAWS)
 
     def recorded(self, folder: Path) -> dict[str, float]:
-        """Closures of people's recordings, NAME.wav with NAME.txt; their times are found by alignment."""
-        files = [path for path in sorted(folder.glob("*.wav")) if path.with_suffix(".txt").is_file()]
-        read = ((read_speech(path), path.with_suffix(".txt").read_text(encoding="utf-8-sig")) for path in files)
-        return self.strangers(
-            ((speech, align_transcript(" ".join(text.split()), speech)) for speech, text in read), 1, 1
+        """Articulation of people's recordings in a folder of `facediff data align`."""
+        said = (
+            (Path(v).name, open_voice(each.voice).speak()) for v in speakers_of(folder) for each in recordings_of(v, 9)
         )
+        return self.strangers(said, 1)
 
-    def strangers(
-        self, said: Iterable[tuple[Array, Sequence[TimedPhoneme]]], draws: int, margin: int = 0
-    ) -> dict[str, float]:
-        """Closures of speech without clips; faces and styles of test A take turns.
+    def strangers(self, said: Iterable[tuple[str, Utterance]], draws: int) -> dict[str, float]:
+        """Articulation of speech without clips; faces and styles of test A take turns.
 
         Args:
-            said: speech with its phonemes.
+            said: speakers, or sentences of one, with an utterance each.
             draws: seeds of each.
-            margin: frames by which a closure may be early or late.
         """
-        chances, gaps = [], []
-        for (samples, phonemes), sample in zip(said, cycle(self.samples["test_a"][::3]), strict=False):
-            rest = self.opening(sample.template.double().numpy()[None] * 1000)
-            times = [(max(0, start - margin), end + margin) for start, end in closures(phonemes, self.model.frame_rate)]
-            speech = 0.6 * samples / np.abs(samples).max()
-            openings = [self.opening(self.animate(speech, sample, draw)) for draw in range(draws)]
-            of_sentence = []
-            for opened, (start, end) in product(openings, times):
-                if end <= len(opened):
-                    of_sentence.append(float((opened[start:end] - rest).min()))
-                    chances.append(_chance(opened - rest < 1, end - start))
-            gaps.append(np.array(of_sentence))
-        every = np.concatenate(gaps)
-        shares = np.array([[(sentence < 1).mean() if len(sentence) else 0.0] for sentence in gaps])
-        drawn = Bootstrap().scores(shares, np.array([[len(sentence)] for sentence in gaps]))
-        (interval,) = Bootstrap().intervals(drawn, 1)
-        half = (interval.high - interval.low) / 2 if interval else float("nan")
-        closed = {"within 1 mm": float((every < 1).mean()), "±": half}
-        return {**closed, "chance": float(np.mean(chances)), "gap": float(np.median(every)), "closures": len(every)}
+        mouths: dict[str, list[MouthMotion]] = {}
+        for (name, utterance), sample in zip(said, cycle(self.samples["test_a"][::3]), strict=False):
+            speech = 0.6 * utterance.samples / np.abs(utterance.samples).max()
+            phonemes = [TimedPhoneme(*astuple(phoneme)) for phoneme in utterance.phonemes]
+            mouths.setdefault(name, []).extend(
+                mouth_motion(
+                    self.animate(speech, sample, draw),
+                    sample.template.double().numpy() * 1000,
+                    self.pairs,
+                    millimetres=1.0,
+                    frame_rate=self.model.frame_rate,
+                    phonemes=phonemes,
+                )
+                for draw in range(draws)
+            )
+        found = by_speaker(mouths)
+        _, low, high = found["closure_auc"]
+        return {**{name: mean for name, (mean, _, _) in found.items()}, "AUC ±": (high - low) / 2, "n": len(mouths)}
 
     def spoken(self, samples: Sequence[Sample], change: Change) -> tuple[Array, Array, Array, Array]:
         """Of each closure: whether the lips close, by chance, and the gap in mm; of each frame: the squared error."""
@@ -512,7 +506,7 @@ def measured(
         only: measure tables and rows whose name contains this.
         root: folder of the corpus; the user's cache folder if None.
         people: voices of people that nobody is trained with.
-        recordings: folders of people's recordings with their words.
+        recordings: folders of `facediff data align`.
     """
     bench = Bench(checkpoint, options, clips, root)
     strangers = dict.fromkeys(clip.attributes["voice"] for clip in bench.data.clips("test_c"))
@@ -547,7 +541,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--clips", type=int, help="most clips of a split")
     parser.add_argument("--only", default="", metavar="WORDS", help="tables and rows whose name contains this")
     parser.add_argument("--people", nargs="*", default=KEPT_OUT_PEOPLE, metavar="VOICE", help="such as flite:slt")
-    parser.add_argument("--recordings", nargs="*", default=[], type=Path, metavar="FOLDER", help="with NAME.txt each")
+    parser.add_argument(
+        "--recordings", nargs="*", default=[], type=Path, metavar="FOLDER", help="of `facediff data align`"
+    )
     parser.add_argument("--data-root", help="folder of the corpus (default: the user's cache folder)")
     parser.add_argument("--json", type=Path, help="write the scores here too")
     given = parser.parse_args(arguments)

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from facediff.evaluation.articulation import MouthMotion, articulation, mouth_motion
 from facediff.metrics import (
     BilabialClosureRate,
     BlinkRate,
@@ -72,11 +73,19 @@ SCORES = {
     "closures": RefereeScore(
         "closures", "higher", 2, "share of p, b and m in which the lips meet in at least one frame"
     ),
+    "chance": RefereeScore("chance", None, 2, "the same share of all other sounds, within 1 mm"),
+    "closure_auc": RefereeScore(
+        "AUC", "higher", 2, "how well the opening tells p, b and m from all other sounds: 0.5 by chance"
+    ),
     "gap": RefereeScore(
         "gap, mm", "lower", 2, "opening of the lips in p, b and m at its smallest, beyond that at rest; mean"
     ),
     "correlation": RefereeScore("opening", "higher", 2, "correlation of the mouth's opening with the reference's"),
     "lag": RefereeScore("lag, ms", "zero", 0, "how late the opening is, by cross-correlation; negative is early"),
+    "open_vowels": RefereeScore("vowels", "one", 2, "opening at a, ɑ, æ …, as a share of the reference's"),
+    "rounding": RefereeScore(
+        "rounding", "one", 2, "narrowing of the mouth at u, o and w against other vowels, as a share of the reference's"
+    ),
     "lips": RefereeScore("lips", "one", 2, "how much the lips move, as a share of the reference (standard deviation)"),
     "jitter": RefereeScore(
         "jitter", "one", 2, "second over first differences of the lips in time, over the reference's"
@@ -121,6 +130,8 @@ class RefereeScores:
             self._closures = {name: BilabialClosureRate(lips, count="closures") for name in ("", *LANGUAGES)}
         else:
             self._openings["jitter"] = DifferenceRatio([1])
+        self._mouths: list[MouthMotion] = []
+        self._true_mouths: list[MouthMotion] = []
         self._gaps: list[float] = []
         self._lags: list[Array] = []
         self._turns: list[Array] = []
@@ -138,6 +149,11 @@ class RefereeScores:
             metric.update(predicted, target)
         timed = [TimedPhoneme(p.start, p.end, p.ipa) for p in clip.phonemes]
         closed = [(start, end) for start, end in closures(timed, self.frame_rate) if end <= frames]
+        if self.jaw is None:
+            for found, vertices in ((self._mouths, points), (self._true_mouths, true)):
+                rest, pairs = self.face.rest, self.face.lip_pairs
+                of_clip = {"millimetres": 1000.0, "frame_rate": self.frame_rate, "phonemes": timed}
+                found.append(mouth_motion(vertices, rest, pairs, **of_clip))  # type: ignore[arg-type]
         if self._closures and closed:
             for name in ("", clip.language):
                 self._closures[name].update(predicted, target, closures=closed)
@@ -163,6 +179,11 @@ class RefereeScores:
         for name, rate in self._closures.items():
             if int(rate.counts[1]):
                 _note(values, f"closures_{name}" if name else "closures", rate)
+        if self._mouths:
+            articulated, reference_scores = articulation(self._mouths), articulation(self._true_mouths)
+            found = {"chance": articulated.chance, "closure_auc": articulated.closure_auc}
+            found |= articulated.shares_of(reference_scores)
+            values |= {name: value for name, value in found.items() if math.isfinite(value)}
         if self._gaps:
             values["gap"] = float(np.mean(self._gaps))
         usable = [scores for scores in self._lags if np.isfinite(scores).all() and scores.any()]
@@ -248,11 +269,11 @@ class PlantedFault:
 
 
 FAULTS = {
-    "delay": PlantedFault("80 ms late", delayed, ("closures", "gap", "correlation", "lag")),
+    "delay": PlantedFault("80 ms late", delayed, ("closures", "closure_auc", "gap", "correlation", "lag")),
     # Lips that hardly part close in time, so that closures alone would call such a model good.
-    "muted": PlantedFault("muted lips", muted, ("lips", "step")),
+    "muted": PlantedFault("muted lips", muted, ("open_vowels", "rounding", "lips", "step")),
     "jitter": PlantedFault("jitter", trembling, ("jitter",)),
-    "sentence": PlantedFault("wrong sentence", wrong_sentence, ("closures", "gap", "correlation")),
+    "sentence": PlantedFault("wrong sentence", wrong_sentence, ("closures", "closure_auc", "gap", "correlation")),
 }
 
 
@@ -308,10 +329,12 @@ class Judgement:
 
     def lacks(self, score: str) -> str:
         """Why a score cannot detect faults in this model, in words; empty if it can."""
-        if score in ("closures", "gap") and self.scores.get("closures", 1) < CLOSES:
+        if score in ("closures", "closure_auc", "gap") and self.scores.get("closures", 1) < CLOSES:
             return f"it closes its lips for fewer than {100 * CLOSES:.0f} % of p, b and m"
         if score in ("correlation", "lag") and self.scores.get("correlation", 0) < FOLLOWS:
             return "its mouth does not follow the speech"
+        if score in ("open_vowels", "rounding") and self.scores.get(score, 1) <= MUTED:
+            return "it hardly opens or rounds its mouth"
         if score in ("lips", "step") and self.scores.get(score, 0) > LIVELY:
             return f"its lips move more than {LIVELY:g} times as much as the reference's"
         if score == "jitter" and self.scores.get("jitter", 0) > SHIVERS:
