@@ -373,7 +373,7 @@ def _track(
                 start = _first_time(container, frame.time) if start is None else start
                 ahead = round((frame.time - start) * rate) - done  # of the samples so far
                 if done and ahead < -RESTART * rate:
-                    faults["have times that begin anew, and follow the others"] += len(block)
+                    say(f"{name}: the times of its sound begin anew at {done / rate:.2f} s; what comes there follows")
                     start, ahead = frame.time - done / rate, 0
                 if ahead > LONGEST_HOLE * rate:
                     raise FaceDiffError(

@@ -192,6 +192,14 @@ def test_labels_of_a_set_close_the_lips(name: str, tmp_path: Path) -> None:
     assert closed_times(found) == closed_times(read_phonemes(path)) == closed
 
 
+@pytest.mark.parametrize("row", ["-0.5,1,m", "2,1,m", "0,inf,m", "0,nan,m"])
+def test_times_that_no_phoneme_has_are_refused(row: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(f"start,end,ipa\n{row}\n", encoding="utf-8")
+    with pytest.raises(FaceDiffError, match="starts below 0"):
+        read_phonemes(path)
+
+
 def test_an_alignment_without_closures_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("start,end,ipa\n0,1,a\n1,2,sil\n2,3,t\n", encoding="utf-8")

@@ -174,8 +174,17 @@ def test_times_that_go_back(tmp_path: Path) -> None:
         overlap = read_speech(path)
     assert like(overlap, np.concatenate([whole[:RATE], whole[round(1.3 * RATE) :]])) > 0.9
     path.write_bytes(shifted(flv, 1.5, -1.5))  # a recorder that was started anew
-    with pytest.warns(Note, match="begin anew"):
+    with pytest.warns(Note, match=r"begin anew at 1\.5\d s"):
         assert like(read_speech(path), whole) > 0.999
+
+
+def test_a_hole_counts_as_long_as_it_lasts(tmp_path: Path) -> None:
+    path = tmp_path / "a.mkv"
+    path.write_bytes(container("matroska", [VOICE], jumps=[(1.0, 1.5)]))
+    with pytest.raises(FaceDiffError, match="max_seconds"):
+        read_speech(path, max_seconds=3.0)
+    with pytest.warns(Note, match=r"1\.50 s of its sound are missing"):
+        assert abs(len(read_speech(path, max_seconds=3.6)) - 3.5 * RATE) < 800
 
 
 @pytest.mark.parametrize("other", [-1.0, -0.8, -0.5, -0.3])
@@ -247,6 +256,13 @@ def test_whole_numbers_in_floating_point_are_scaled(dtype: Any, floating: Any, t
         np.testing.assert_allclose(read_stretch(tmp_path / "a.wav", 9, 99, None), expected[9:108], atol=1e-6)
     with pytest.raises(FaceDiffError, match="full scale of 1"):
         stream_piece(whole.astype(np.float32))
+
+
+def test_samples_of_8_bits_are_as_loud_as_those_of_16() -> None:
+    expected = speech_of(np.round(VOICE * 32768).astype(np.int16), RATE).speech
+    found = speech_of(np.round(VOICE * 128 + 128).astype(np.uint8), RATE).speech
+    np.testing.assert_allclose(found, expected, atol=0.5 / 128 + 1e-6)
+    assert np.std(found) == pytest.approx(np.std(expected), rel=2e-3)
 
 
 def test_sound_that_is_a_little_too_loud_is_divided_by_its_peak() -> None:

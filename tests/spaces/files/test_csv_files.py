@@ -92,7 +92,27 @@ def test_timecodes_of_all_times() -> None:
         back = fields_of(timecode(seconds))
         assert back is not None
         assert abs(back[0] + back[1] / SIXTIETHS - seconds) < 1e-9
-    assert fields_of("00:00:61:00.0") is None
+    for text in ("00:00:60:00.0", "00:60:00:00.0", "24:00:00:00.0", "00:00:00:60.0", "00:00:00"):
+        assert fields_of(text) is None
+    assert fields_of("23:59:59:59.999") == (86_399, 59.999)
+
+
+def test_a_row_a_second_is_read_at_its_rate(tmp_path: Path) -> None:
+    codes = tuple(f"00:00:0{second}:00.000" for second in range(5))
+    assert read_parameters(write_take(tmp_path / "take.csv", codes)).frame_rate == 1.0
+
+
+@pytest.mark.parametrize("name", ["JawOpen", "EyeBlinkLeft", "MouthClose"])
+def test_a_table_without_a_weight_is_refused(name: str, tmp_path: Path) -> None:
+    path = write_take(tmp_path / "take.csv")
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    at = rows[0].index(name)
+    path.write_text("\n".join(",".join(row[:at] + row[at + 1 :]) for row in rows))
+    with pytest.raises(FaceDiffError, match=name[1:]):
+        read_parameters(path)
+    path.write_text("timeCode,blendShapes\n0,1\n")
+    with pytest.raises(FaceDiffError, match="has no columns"):
+        read_parameters(path)
 
 
 def test_read_live_link_goes_on_after_midnight(tmp_path: Path) -> None:
