@@ -31,7 +31,7 @@ from facediff.utils.jobs import PerWorker
 SOUNDS = (".wav", ".flac", ".mp3", ".m4a", ".ogg", ".opus")
 SHORTEST, LONGEST = 2.5, 8.0
 """Seconds of a piece: shorter ones are joined to the next, longer ones are cut between words."""
-LEAST = 1.5  # seconds of a piece that is kept
+LEAST = 1.0  # seconds of a piece that is kept
 PAUSE, MARGIN = 0.15, 0.2
 """Seconds of a pause at which recordings are cut, and those of it that a piece keeps."""
 ALIGNMENTS = ".alignments"
