@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from facediff.editing.face_features import Features, FrontView, find_features
 from facediff.editing.surface import Surface, nearest
+from facediff.editing.symmetry import Plane, symmetry_plane
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size
 from facediff.mesh.alignment import TUKEY
@@ -36,8 +37,9 @@ def place(
     *,
     samples: int = FINE_SAMPLES,
     rounds: int = FINE_ROUNDS,
+    turns: bool = True,
 ) -> Similarity:
-    """The similarity that aligns one surface with another.
+    """The similarity that aligns one surface with another; without ``turns``, its start's rotation stays.
 
     Starts are the 24 rotations of one frame of axes into another and the principal axes, with sizes made equal;
     the best by nearest vertices, both ways and trimmed, is refined by nearest points of the surface: Besl and McKay, "A
@@ -63,7 +65,7 @@ def place(
         # Seven unknowns want a few times as many places; with fewer, the similarity of the last round stands.
         if np.count_nonzero(weights) < 20:
             break
-        step = _towards_planes(laid, matches.points, matches.normals, weights, goal.size)
+        step = _towards_planes(laid, matches.points, matches.normals, weights, goal.size, turns=turns)
         similarity = similarity.then(step)
         if np.abs(step.apply(laid) - laid).max() < SETTLED * goal.size:
             break
@@ -113,12 +115,15 @@ def _by_vertices(source: Array, target: Array, current: Similarity) -> tuple[Sim
     return similarity, float(apart[inliers].mean() / face_size(target))
 
 
-def _towards_planes(points: Array, goals: Array, normals: Array, weights: Array, size: float) -> Similarity:
+def _towards_planes(
+    points: Array, goals: Array, normals: Array, weights: Array, size: float, *, turns: bool
+) -> Similarity:
     """The small similarity with the least weighted squared distances to planes, to first order."""
     centre = points.mean(axis=0)
     arms = (points - centre) / size
     # The seven unknowns are rotation and growth about the centre, and translation.
     rows = np.concatenate([np.cross(arms, normals), normals, (arms * normals).sum(axis=1, keepdims=True)], axis=1)
+    rows[:, :3] *= turns
     left = ((goals - points) * normals).sum(axis=1) / size
     weighted = rows * weights[:, None]
     # Planes leave some directions undetermined (the rotation of a sphere): least squares does not move along them.
@@ -140,6 +145,9 @@ END = 0.135  # Share of a standing figure's height that its head takes
 CONTINUED = 12  # Starts that are continued
 COLLAPSED = 0.05  # A start that shrinks to less than this share has run into a point
 LOOKED_AT = 5  # Alignments in which the mouth is searched for
+TURNED_LITTLE = 5.0, 40.0  # Degrees by which an alignment may be turned against a mesh's own axes for no good reason
+STRAIGHT = 1.5  # Degrees by which a mesh's mirror plane may differ from its own axes
+ABOUT_AS_WELL = 1.8
 WITH_MOUTH, WITH_EYE = 0.5, 0.85
 """Factors on the distance of an alignment where these are found."""
 
@@ -184,9 +192,44 @@ def place_face(
         raise FaceDiffError("nothing on it is like the animation's face; give a mesh that shows one")
     _, back, target_features = min(tried, key=lambda trial: trial[0])
     refined = place(_near(moved, back, points, features), goal, back, samples=700, rounds=30)
+    upright = _upright(moved, goal, points, features, refined)
+    if target_features is not None and upright is not None:
+        there = find_features(upright.apply(moved.vertices), moved.faces, features)
+        if there is not None and sum(eye is None for eye in there.eyes) <= sum(e is None for e in target_features.eyes):
+            return upright, there
     if target_features is not None:
         target_features = find_features(refined.apply(moved.vertices), moved.faces, features) or target_features
     return refined, target_features
+
+
+def _upright(
+    moved: Surface, goal: Surface, points: Array, features: Features, refined: Similarity
+) -> Similarity | None:
+    """The alignment in the mesh's own axes, where it fits about as well as one that nods against them.
+
+    A stylised head is no person's in another size, and nods so that its forehead comes to lie on one. That a mesh is
+    its own mirror image along x tells that its axes are upright.
+    """
+    angle = np.rad2deg(np.arccos(np.clip((np.trace(refined.rotation) - 1) / 2, -1, 1)))
+    if not TURNED_LITTLE[0] < angle < TURNED_LITTLE[1]:
+        return None
+    face = _near(moved, refined, points, features)
+    vertices = moved.vertices[np.unique(face.faces)]
+    mirror = symmetry_plane(vertices, Plane(np.array([1.0, 0.0, 0.0]), float(np.median(vertices[:, 0]))))
+    if mirror.normal[0] < np.cos(np.deg2rad(STRAIGHT)):
+        return None
+    mouth = features.mouth.centre
+    start = Similarity(np.eye(3), mouth - refined.scale * refined.inverse().apply(mouth), refined.scale)
+    upright = place(_near(moved, start, points, features), goal, start, samples=700, rounds=30, turns=False)
+    apart = [_apart(_near(moved, back, points, features), goal, back) for back in (upright, refined)]
+    return upright if apart[0] < ABOUT_AS_WELL * apart[1] else None
+
+
+def _apart(moved: Surface, goal: Surface, back: Similarity) -> float:
+    """The median distance of a mesh's vertices from the goal."""
+    vertices = np.unique(moved.faces)
+    some = vertices if len(vertices) <= MANY else np.random.default_rng(0).choice(vertices, MANY, replace=False)
+    return float(np.median(nearest(goal, back.apply(moved.vertices[some]), np.zeros((len(some), 3)), 0.0).distances))
 
 
 def _near(moved: Surface, back: Similarity, points: Array, features: Features) -> Surface:

@@ -8,16 +8,19 @@ import fast_simplification
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from facediff.animation import Animation
 from facediff.editing import face_features
-from facediff.editing.correspondence import LIDS_AT_REST, Correspondence, correspond
+from facediff.editing.correspondence import LIDS_AT_REST, Correspondence, correspond, placed
 from facediff.editing.face_features import LOWER_LIP, UPPER_LIP, find_features
 from facediff.editing.fit_check import check_fit
 from facediff.editing.retargeting import transfer, transfer_checked
+from facediff.editing.surface import Surface
 from facediff.mesh import Mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.mesh import triangle_areas
+from facediff.synthetic.head.parts import build_head
 from tests.fakes.heads import FAMILY, INTERIOR, Head, person, sealed_lips, talking
 from tests.fakes.small_face import M2, Shape, small_shapes
 
@@ -91,6 +94,23 @@ def test_a_nod_needs_no_place_on_the_mesh(animation: Animation) -> None:
     assert (same.good, same.faults) == (True, ())
     assert np.allclose(made.vertices, transfer(nodding, found, mesh).vertices)
     assert np.ptp(made.vertices[1] - made.template, axis=0)[2] > 0.02 * found.similarity.scale
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nod", [0.0, 20.0])
+def test_a_stylised_head_stays_upright_and_a_head_that_nods_does_not(animation: Animation, nod: float) -> None:
+    """A short lower face, a wide head and a forehead that bulges; or a person's head that looks down."""
+    head = build_head()
+    x, y, z = (head.vertices / 1000).T
+    if nod == 0:
+        bulge = z + 0.015 * np.exp(-(((y - 0.08) / 0.04) ** 2))
+        x, y, z = 1.125 * x, np.where(y < 0.02, 0.02 + 0.875 * (y - 0.02), y), 1.05 * bulge
+    turn = Rotation.from_euler("x", nod, degrees=True)
+    source = Surface(animation.template.astype(np.float64), animation.triangles.astype(np.int64))
+    back, _, _ = placed(source, Surface(turn.apply(np.stack([x, y, z], axis=1)), head.faces[:-1].astype(np.int64)))
+    pitch, *others = np.abs(Rotation.from_matrix(back.rotation).as_euler("xyz", degrees=True))
+    assert pitch == pytest.approx(nod, abs=4)
+    assert max(others) < 2
 
 
 @pytest.mark.slow
