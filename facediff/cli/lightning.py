@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from facediff import registry
 from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, loggers_of, name_of
 from facediff.cli.process import StoppedBySignal, tell
-from facediff.cli.words import change_values, place_of, value_of
+from facediff.cli.words import change_values, place_of, refuse_early, value_of
 from facediff.errors import FaceDiffError, printable
 from facediff.hyperparameters import plain
 from facediff.utils.files import config_dir
@@ -147,7 +147,9 @@ def checked_words(name: str, arguments: Sequence[str]) -> list[str]:
             f"--ckpt_path {checkpoint}: the config says where the runs are; add the run's --config, or give the path "
             f"of its checkpoints/{checkpoint}.ckpt"
         )
-    return change_values(as_parts(change_values(arguments, find_config)), fresh_component)
+    words = as_parts(change_values(arguments, find_config))
+    refuse_early(words)
+    return change_values(words, fresh_component)
 
 
 def load_components() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import yaml
 
 from facediff import registry
-from facediff.errors import choices, lacking
+from facediff.errors import FaceDiffError, choices, lacking
 from facediff.utils.hints import is_path
 
 YAML = (".yaml", ".yml")
@@ -42,7 +43,7 @@ def explain(arguments: Sequence[str]) -> str:
     """The fault of a class that words or the files in them name; empty if there is none.
 
     An error inside a file of the user's comes with its file and line; a name of a model, a corpus or a component that
-    does not exist, with the nearest. Everything else is the parser's to say.
+    does not exist, with the nearest; and an option before its config. Everything else is the parser's to say.
     """
     classes: list[tuple[str, str]] = []
 
@@ -56,7 +57,45 @@ def explain(arguments: Sequence[str]) -> str:
         return value
 
     change_values(arguments, note)
-    return next(filter(None, (fault_of(option, name) for option, name in dict.fromkeys(classes))), "")
+    faults = filter(None, (fault_of(option, name) for option, name in dict.fromkeys(classes)))
+    return next(faults, "") or next((f"{flag} {EARLY}" for flag, _ in early_options(arguments)), "")
+
+
+EARLY = "stands before --config; give options after --config, which they change"
+
+
+def early_options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Options of a part of a config that stand before a config, ``--model.dim``, each with the config's file."""
+    earlier: list[str] = []
+    found: list[tuple[str, str]] = []
+
+    def look(flag: str, value: str) -> str:
+        if flag in ("-c", "--config"):
+            found.extend((option, value) for option in earlier)
+        elif flag.startswith("--") and "." in flag:
+            earlier.append(flag)
+        return value
+
+    change_values(arguments, look)
+    yield from found
+
+
+def refuse_early(arguments: Sequence[str]) -> None:
+    """Refuse options that stand before a config which sets them again: the config would count, without a word."""
+    for flag, file in early_options(arguments):
+        if os.path.isfile(file):  # noqa: PTH113 - also of a long text
+            content = yaml.load(Path(file).read_text("utf-8-sig"), yaml.BaseLoader)  # noqa: S506
+            if _sets(content, flag[2:]):
+                raise FaceDiffError(f"{flag} {EARLY}: {file} sets it too")
+
+
+def _sets(content: Any, option: str) -> bool:  # noqa: ANN401
+    """Whether a config's content sets an option; a text in its place is a class or a file, and sets all of it."""
+    name, _, rest = option.partition(".")
+    if not isinstance(content, dict) or not option:
+        return bool(content)
+    holders = [holder for holder in (content, content.get("init_args")) if isinstance(holder, dict)]
+    return any(_sets(holder[name], rest) for holder in holders if name in holder)
 
 
 def classes_in(option: str, content: Any, folder: Path) -> Iterator[tuple[str, str]]:  # noqa: ANN401

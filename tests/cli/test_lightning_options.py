@@ -76,6 +76,29 @@ def test_an_option_given_twice_is_refused(words: list[str], capsys: pytest.Captu
     assert words[0].partition("=")[0] in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--model.dim=16",
+        "--model.decoder.num_layers=1",
+        "--trainer.max_epochs=3",
+        "--data.batch_size=2",
+        "--model.sampler.steps=3",
+    ],
+)
+@pytest.mark.parametrize(
+    "config", [["--config=configs/experiment/puppet.yaml"], ["-c", "configs/experiment/puppet.yaml"]]
+)
+def test_an_option_before_its_config_is_refused(option: str, flag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The config would count, without a word, or the parser's own words would."""
+    words = f"{flag}configs/experiment/puppet.yaml".split()
+    assert main(["fit", option, *words, "--print_config"]) in (0, 2)
+    printed = capsys.readouterr()
+    flag, _, value = option.partition("=")
+    name = flag.rpartition(".")[2]
+    assert (f"{flag} stands before --config" in printed.err) or f"{name}: {value}\n" in printed.out
+
+
 def test_options_that_add_may_be_repeated() -> None:
     refuse_repeated(["--config=a", "--config", "b", "--trainer.callbacks+=A", "--trainer.callbacks+=B"])
     refuse_repeated(["--model.dim=3", "--model.dim=3", "--data.root=x", "--model.decoder=gru"])
