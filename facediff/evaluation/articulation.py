@@ -181,5 +181,5 @@ def area_under_curve(higher: Array, lower: Array) -> float:
     return float(below.mean() / (2 * len(lower)))
 
 
-def _mean(values: npt.NDArray[np.generic]) -> float:
+def _mean(values: Array | npt.NDArray[np.bool_]) -> float:
     return float(np.mean(values)) if len(values) else math.nan

@@ -400,7 +400,7 @@ class _SileroListener(Listener):
     """A step is speech if it is for the level, and for the network in the chunk of the step's middle."""
 
     def __init__(self, gate: SileroGate) -> None:
-        import onnxruntime
+        import onnxruntime  # type: ignore[import-untyped]
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
