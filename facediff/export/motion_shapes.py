@@ -144,8 +144,7 @@ def leading_axes(parts: Iterable[Array], rank: int) -> Array:
     lengths, axes = np.zeros(0), None
     for block in in_blocks(parts, STRETCH):
         rows = block if axes is None else np.concatenate([lengths[:, None].astype(np.float32) * axes, block])
-        wide = rows.astype(np.float64)
-        squares, vectors = np.linalg.eigh(wide @ wide.T)
+        squares, vectors = np.linalg.eigh(sum(columns @ columns.T for columns in _blocks(rows)))
         order = np.argsort(squares)[::-1][:rank]
         order = order[squares[order] > max(squares.max(), 0) * 1e-10]
         lengths = np.sqrt(squares[order])
@@ -162,7 +161,7 @@ def in_blocks(parts: Iterable[Array], size: int) -> Iterator[Array]:
         while sum(map(len, waiting)) >= size:
             joined = np.concatenate(waiting)
             yield joined[:size]
-            waiting = [joined[size:]]
+            waiting = [joined[size:].copy()]  # which does not keep the rest in memory
     if sum(map(len, waiting)):
         yield np.concatenate(waiting)
 
