@@ -154,6 +154,7 @@ def sync_warnings(root: Path, people: Iterable[str]) -> Iterator[str]:
     from facediff.metrics import LipPairs
     from facediff.pipelines.animator import load
     from facediff.speech.audio import read_speech
+    from facediff.utils.arrays import open_array
     from facediff.utils.cross_correlation import correlations, peak
 
     model, rate = load("puppet"), read_manifest(root)["frame_rate"]
@@ -161,7 +162,7 @@ def sync_warnings(root: Path, people: Iterable[str]) -> Iterator[str]:
     for person in people:
         scores = []
         for file in sorted((root / "vertices_npy").glob(f"{person}_s*.npy"))[:CLIPS]:
-            frames = np.load(file, mmap_mode="r")
+            frames = open_array(file, kinds="f")
             gaps = pair_distances(frames.reshape(len(frames), -1, 3), pairs)
             animation = model.animate(read_speech(root / "wav" / f"{file.stem}.wav"), SAMPLE_RATE, seed=0)
             expected = pair_distances(animation.vertices, np.asarray(animation.inner_lip_pairs))
