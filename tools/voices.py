@@ -9,7 +9,7 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
   share with the closures moved to every other time of the clip. *Within 1 mm* and *gap*: how far the lips' pairs are
   apart at their nearest in a closure, compared with the neutral face, in mm.
 - *kept out*: the clips of test C, whose voices nobody is trained with, by voice.
-- *people kept out*: articulation (facediff/evaluation/articulation.py) in all test sentences and 48 others by voices of
+- *people kept out*: articulation (facediff/evaluation/articulation.py) in all test sentences and 32 others by voices of
   people that nobody is trained with, as far as they are installed, each with two seeds; means over sentences, and half
   of the 95 % interval of the AUC. ``--people`` names other voices.
 - *recordings*: the same of people's own, in a folder of `facediff data align` (``--recordings FOLDER``); means over
@@ -97,22 +97,6 @@ FURTHER = (
     "Her example made a deep impression on him.",
     "The bell rang, and the children stopped talking.",
     "Trim the branches before the first frost.",
-    "The museum's lamps are dimmed after midnight.",
-    "A small dog jumped over the gate and ran off.",
-    "They planted beans, pumpkins and a plum tree.",
-    "It became clear that the bridge was not safe.",
-    "My neighbour plays the trumpet on Sunday mornings.",
-    "Could you explain the difference between them?",
-    "The lemons smelled of summer and of the south.",
-    "Pack warm clothes, it gets cold up there.",
-    "He stumbled on the steps and dropped the lamp.",
-    "Many of the members could not come this time.",
-    "The train from Plymouth is half an hour late.",
-    "She whispered something, and everybody laughed.",
-    "The paper says that the prices will come down.",
-    "Behind the temple there is a bamboo garden.",
-    "We tried everything, but the engine did not move.",
-    "Compare the two samples and tell me what you see.",
 )
 """What people kept out say beside the test sentences; of no list of the corpus."""
 PAUSE = 1.0
