@@ -7,6 +7,7 @@ from facediff.callbacks.checkpoints import LastCheckpoint
 from facediff.callbacks.dashboard import GradientNorm, RunDescription
 from facediff.callbacks.outputs import EpochLines, PredictionWriter, ScoreTable
 from facediff.callbacks.previews import SamplingPreview
+from facediff.callbacks.sounds import SpokenSoundsTerm
 from facediff.callbacks.speed import CompiledTraining, SpeechFeatureCache
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "SamplingPreview",
     "ScoreTable",
     "SpeechFeatureCache",
+    "SpokenSoundsTerm",
     "defaults",
 ]
 

@@ -14,21 +14,9 @@ from facediff.errors import FaceDiffError
 from facediff.speech.text_grids import read_text_grid, write_text_grid
 from facediff.synthetic.recordings import phones_of, recordings_of, speakers_of
 from facediff.synthetic.voices import open_voice
+from tests.fakes.aligned import write_aligned
 
 TEXT = "My brother bought a map. Maybe we could meet him in the park tomorrow."
-
-
-def write_aligned(path: Path, seconds: float, pauses: list[float]) -> None:
-    """A recording of syllables of 0.2 s and pauses of 0.3 s at given times, with its TextGrid."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    soundfile.write(path, 0.1 * np.random.default_rng(0).standard_normal(round(seconds * 16_000)), 16_000)
-    phones, time = [], 0.0
-    while time < seconds - 0.05:
-        pause = any(abs(time - at) < 0.1 for at in pauses)
-        end = min(time + (0.3 if pause else 0.2), seconds)
-        phones.append((time, end, "" if pause else ["M", "AA"][len(phones) % 2]))
-        time = end
-    write_text_grid(path.with_suffix(".TextGrid"), {"words": phones, "phones": phones}, seconds)
 
 
 def test_text_grids_are_written_as_they_are_read(tmp_path: Path) -> None:

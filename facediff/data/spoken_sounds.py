@@ -1,0 +1,145 @@
+"""Speech with the sounds that can be seen on a mouth, to teach an audio encoder by people without a face.
+
+Sounds that look alike are one class, by their targets in :mod:`facediff.synthetic.articulation`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from facediff.data.augmentation import Example
+from facediff.data.datamodule import SpeechMotionDataModule
+from facediff.errors import FaceDiffError
+from facediff.speech.audio import samples_for
+from facediff.speech.phonemes import TimedPhoneme, phonemes_file, read_phonemes
+from facediff.synthetic.articulation import articulations
+from facediff.synthetic.recordings import recordings_of, speakers_of
+from facediff.synthetic.voices import open_voice
+
+SOUNDS = (
+    *("pause", "bilabial", "labiodental", "rounded glide or close vowel", "postalveolar", "dental", "sibilant"),
+    *("rounded vowel", "open vowel", "mid vowel", "close vowel", "other consonant"),
+)
+IGNORED = -1  # frames of padding
+BRIEF = (1, 2)
+"""Sounds that mark the frame of their middle, however short they are."""
+
+
+def visible_sound(ipa: str) -> int:
+    """The place in :data:`SOUNDS` of a phoneme; a pause for what is not known."""
+    targets = articulations(ipa)[0].targets if ipa else {}
+    jaw, pucker = targets.get("jawOpen", 0.0), targets.get("mouthPucker", 0.0)
+    if not targets:
+        return 0
+    if articulations(ipa)[0].closes:
+        return 1
+    if targets.get("mouthRollLower", 0.0) > 0.5:
+        return 2
+    if pucker > 0.6:
+        return 3
+    if targets.get("mouthFunnel", 0.0) > 0.4 and jaw < 0.12:
+        return 4
+    if targets.get("tongueForward", 0.0) > 0.5:
+        return 5
+    if "mouthSmile" in targets:  # vowels alone
+        return 7 if pucker > 0.15 else 8 if jaw > 0.3 else 9 if jaw > 0.16 else 10
+    return 6 if targets.get("mouthLowerDown", 0.0) >= 0.4 and jaw < 0.1 else 11
+
+
+def sounds_in_frames(phonemes: Sequence[TimedPhoneme], frames: int, frame_rate: float) -> npt.NDArray[np.int64]:
+    """The sound at the middle of each frame (frames,), as its place in :data:`SOUNDS`."""
+    sounds = np.zeros(frames, np.int64)
+    for phoneme in phonemes:
+        sound = visible_sound(phoneme.ipa)
+        first, last = (math.ceil(time * frame_rate - 0.5) for time in (phoneme.start, phoneme.end))
+        sounds[max(first, 0) : max(last, 0)] = sound
+        middle = math.floor(phoneme.middle * frame_rate)
+        if sound in BRIEF and 0 <= middle < frames:
+            sounds[middle] = sound
+    return sounds
+
+
+@dataclass(frozen=True, eq=False)
+class SoundBatch:
+    """Pieces of speech with their sounds.
+
+    Attributes:
+        audio: (batch, samples) at 16 kHz, padded with zeros.
+        audio_lengths: (batch,) valid samples.
+        frame_lengths: (batch,) valid frames.
+        sounds: (batch, frames), places in :data:`SOUNDS`, :data:`IGNORED` on padding.
+    """
+
+    audio: Tensor
+    audio_lengths: Tensor
+    frame_lengths: Tensor
+    sounds: Tensor
+
+
+class SpokenSounds:
+    """People's recordings and a corpus's training clips, from which pieces are drawn, half of each.
+
+    Args:
+        recordings: folder of `facediff data align`.
+        data: the corpus; without phoneme tables, people's recordings are used alone.
+    """
+
+    def __init__(self, recordings: Path, data: SpeechMotionDataModule) -> None:
+        self.frame_rate = data.frame_rate
+        augmenter = data.augmenter
+        self.augmenter = augmenter if augmenter is not None and augmenter.speech_only else None
+        self.people: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]] = []
+        for speaker in speakers_of(recordings):
+            for recording in recordings_of(speaker, MOST):
+                said = open_voice(recording.voice).speak("")
+                phonemes = [TimedPhoneme(*astuple(phoneme)) for phoneme in said.phonemes]
+                frames = int(len(said.samples) / samples_for(1, self.frame_rate))
+                if frames:
+                    self.people.append((said.samples, sounds_in_frames(phonemes, frames, self.frame_rate)))
+        if not self.people:
+            raise FaceDiffError(f"{recordings}: holds no recording of a frame or more; align longer ones")
+        self.corpus = data.corpus
+        self.clips = [(clip, path) for clip in data.clips("train") if (path := phonemes_file(data.root, clip.name))]
+
+    def draw(self, count: int, seconds: float, random: np.random.Generator) -> SoundBatch:
+        """So many pieces of up to so many seconds."""
+        pieces, sounds = [], []
+        for number in range(count):
+            if self.clips and number % 2:
+                clip, path = self.clips[int(random.integers(len(self.clips)))]
+                frames = self.corpus.frames(clip)
+                speech = self.corpus.read_audio(clip, 0, frames).numpy()
+                known = sounds_in_frames(read_phonemes(path), frames, self.frame_rate)
+            else:
+                speech, known = self.people[int(random.integers(len(self.people)))]
+            length = min(len(known), max(1, round(seconds * self.frame_rate)))
+            start = int(random.integers(len(known) - length + 1))
+            first, last = (samples_for(frame, self.frame_rate) for frame in (start, start + length))
+            pieces.append(torch.from_numpy(self._augmented(speech[first:last], int(random.integers(2**31)))))
+            sounds.append(torch.from_numpy(known[start : start + length]))
+        pad = torch.nn.utils.rnn.pad_sequence
+        return SoundBatch(
+            pad(pieces, batch_first=True),
+            torch.tensor([len(piece) for piece in pieces]),
+            torch.tensor([len(known) for known in sounds]),
+            pad(sounds, batch_first=True, padding_value=IGNORED),
+        )
+
+    def _augmented(self, speech: npt.NDArray[np.float32], seed: int) -> npt.NDArray[np.float32]:
+        if self.augmenter is None:
+            return np.array(speech, np.float32)
+        nothing = np.zeros((1, 0), np.float32)
+        example = Example(np.array(speech, np.float32), nothing, self.frame_rate, nothing[0], nothing[0])
+        return self.augmenter(example, seed).speech
+
+
+MOST = 100
+"""Recordings of a speaker that are used."""
