@@ -48,6 +48,7 @@ from facediff.utils.batch import do_all
 from facediff.utils.checksums import describe_files, same_sizes
 from facediff.utils.files import atomic_folder
 from facediff.utils.jobs import is_cluster
+from facediff.utils.limits import quoted
 from facediff.utils.plain_files import read_json, write_json, write_table
 
 CORPUS = "facediff-puppet"
@@ -238,7 +239,7 @@ def generate(
     facts = _facts(seed, drawn, people, variant)
     if only is None and _is_complete(root, facts):
         return
-    _refuse_foreign(root, variant.corpus)
+    _refuse_other(root, facts)
     every = variant.clips(drawn, people)
     clips = [clip for clip in every if only is None or clip.name in only]
     check_known("the built-in corpus", "clip", only or (), [clip.name for clip in clips])
@@ -446,12 +447,21 @@ def _in_quiet(phonemes: tuple[SpokenPhoneme, ...], before: float, end: float) ->
     return tuple(moved)
 
 
-def _refuse_foreign(root: Path, corpus: str) -> None:
-    """Never replace a folder that this generator did not write."""
-    if root.is_dir() and any(root.iterdir()) and (read_json(root / MANIFEST) or {}).get("corpus") != corpus:
+def _refuse_other(root: Path, facts: dict[str, object]) -> None:
+    """Never replace a folder that this generator did not write, or a whole corpus of other speakers."""
+    if not root.is_dir() or not any(root.iterdir()):
+        return
+    manifest = read_json(root / MANIFEST) or {}
+    if manifest.get("corpus") != facts["corpus"]:
         raise FaceDiffError(
             f"{root}: is not empty and holds no manifest of the built-in corpus; choose another folder, or remove it"
         )
+    for name in ("seed", "drawn", "people") if manifest.get("whole") else ():
+        if manifest.get(name) != facts[name]:
+            raise FaceDiffError(
+                f"{root}: holds the corpus with {name} {quoted(manifest.get(name))}, not {quoted(facts[name])}; ask "
+                f"for the same, choose another folder, or remove this one"
+            )
 
 
 def _write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:

@@ -243,8 +243,13 @@ def test_only_a_whole_corpus_is_complete(tmp_path: Path, monkeypatch: pytest.Mon
     make()
     (root / "wav" / f"{every[1].name}.wav").write_bytes(b"")
     make()
-    make(seed=1)
-    assert [first == second for first, second in pairwise(stamps)] == [False, True, False, False]
+    assert [first == second for first, second in pairwise(stamps)] == [False, True, False]
+    for other in ({"seed": 1}, {"drawn": 1}, {"people": ["flite:awb"]}):
+        with pytest.raises(
+            FaceDiffError, match=rf"corpus: holds the corpus with {next(iter(other))} .*choose another folder"
+        ):
+            make(**other)
+    assert (root / "manifest.json").stat().st_mtime_ns == stamps[-1]
 
 
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
