@@ -135,17 +135,21 @@ def recorded_names(people: Sequence[str]) -> tuple[str, ...]:
 
 
 def _recorded(people: Sequence[str]) -> list[str]:
-    return [voice for voice in people if voice.startswith(f"{ALIGNED}:")]
+    return [voice for voice in people if _is_recorded(voice)]
+
+
+def _is_recorded(voice: str) -> bool:
+    return voice.startswith(f"{ALIGNED}:")
 
 
 def member_of(name: str, people: Sequence[str] = ()) -> CastMember:
     """One of the cast, or a drawn speaker, by name; ``people`` are the voices of people that drawn ones speak with."""
     if name in CAST:
         return CAST[name]
-    drawn, recorded = tuple(voice for voice in people if voice not in _recorded(people)), _recorded(people)
     number = int(name[1:])
     if name.startswith(DRAWN):
-        return _drawn(number, drawn)
+        return _drawn(number, tuple(voice for voice in people if not _is_recorded(voice)))
+    recorded = _recorded(people)
     return replace(_drawn(RECORDED_FROM + number, ()), name=name, voice=recorded[number - 1] if recorded else "")
 
 
