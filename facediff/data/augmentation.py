@@ -121,6 +121,11 @@ class Augmenter:
         """Whether all augmentations leave the motion as it is, in whatever form it comes."""
         return all(isinstance(change, SpeechAugmentation) for change in self.augmentations)
 
+    def change_speech(self, speech: Wave, seed: int) -> npt.NDArray[np.float32]:
+        """Speech (S,) as augmentations of speech alone change it, with a motion or without one."""
+        nothing = np.zeros((1, 0), np.float32)
+        return self(Example(speech, nothing, 1.0, nothing[0], nothing[0]), seed).speech
+
     def __call__(self, example: Example, seed: int) -> Example:
         """The clip as these augmentations change it; the same seed changes it in the same way."""
         random = np.random.default_rng(seed)

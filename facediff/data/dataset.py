@@ -451,13 +451,13 @@ class MotionDataset(Dataset[Sample]):
         self, augmenter: Augmenter, clip: Clip, audio: Tensor, motion: Tensor, seed: int
     ) -> tuple[Tensor, Tensor]:
         """Speech (samples,) and motion (frames, V, 3) as the augmenter changes them."""
-        rest = mouth = np.empty(0, np.float32)
-        if not augmenter.speech_only:
-            # A recording begins and ends without speech: of its two ends, the one nearer to the neutral face.
-            mouth = np.ones(len(motion[0]), np.float32) if self.mouth is None else self.mouth
-            last = self.corpus.frames(clip) - 1
-            ends = [self.corpus.read_motion(clip, frame, frame + 1)[0].numpy() for frame in (0, last)]
-            rest = min(ends, key=lambda face: float(np.square(face[mouth > 0]).sum()))
+        if augmenter.speech_only:  # whatever form the motion has
+            return torch.from_numpy(augmenter.change_speech(audio.numpy(), seed)), motion
+        frames = self.corpus.frames(clip)
+        # A recording begins and ends without speech: of its two ends, the one nearer to the neutral face.
+        mouth = np.ones(len(motion[0]), np.float32) if self.mouth is None else self.mouth
+        ends = [self.corpus.read_motion(clip, frame, frame + 1)[0].numpy() for frame in (0, frames - 1)]
+        rest = min(ends, key=lambda face: float(np.square(face[mouth > 0]).sum()))
         example = Example(audio.numpy(), motion.numpy(), self.corpus.frame_rate, rest, mouth)
         changed = augmenter(example, seed)
         return torch.from_numpy(changed.speech), torch.from_numpy(changed.motion)

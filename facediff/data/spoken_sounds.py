@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.data.augmentation import Example
 from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import samples_for
@@ -31,6 +31,8 @@ SOUNDS = (
 IGNORED = -1  # frames of padding
 BRIEF = (1, 2)
 """Sounds that mark the frame of their middle, however short they are."""
+MOST = 100
+"""Recordings of a speaker that are used."""
 
 
 def visible_sound(ipa: str) -> int:
@@ -108,22 +110,21 @@ class SpokenSounds:
             raise FaceDiffError(f"{recordings}: holds no recording of a frame or more; align longer ones")
         self.corpus = data.corpus
         self.clips = [(clip, path) for clip in data.clips("train") if (path := phonemes_file(data.root, clip.name))]
+        self._sounds: dict[int, npt.NDArray[np.int64]] = {}
 
     def draw(self, count: int, seconds: float, random: np.random.Generator) -> SoundBatch:
         """So many pieces of up to so many seconds."""
         pieces, sounds = [], []
         for number in range(count):
             if self.clips and number % 2:
-                clip, path = self.clips[int(random.integers(len(self.clips)))]
-                frames = self.corpus.frames(clip)
-                speech = self.corpus.read_audio(clip, 0, frames).numpy()
-                known = sounds_in_frames(read_phonemes(path), frames, self.frame_rate)
+                index = int(random.integers(len(self.clips)))
+                read, known = partial(self.corpus.read_audio, self.clips[index][0]), self._sounds_of(index)
             else:
                 speech, known = self.people[int(random.integers(len(self.people)))]
+                read = partial(self._stretch, speech)
             length = min(len(known), max(1, round(seconds * self.frame_rate)))
             start = int(random.integers(len(known) - length + 1))
-            first, last = (samples_for(frame, self.frame_rate) for frame in (start, start + length))
-            pieces.append(torch.from_numpy(self._augmented(speech[first:last], int(random.integers(2**31)))))
+            pieces.append(self._augmented(read(start, start + length), int(random.integers(2**31))))
             sounds.append(torch.from_numpy(known[start : start + length]))
         pad = torch.nn.utils.rnn.pad_sequence
         return SoundBatch(
@@ -133,13 +134,19 @@ class SpokenSounds:
             pad(sounds, batch_first=True, padding_value=IGNORED),
         )
 
-    def _augmented(self, speech: npt.NDArray[np.float32], seed: int) -> npt.NDArray[np.float32]:
+    def _sounds_of(self, index: int) -> npt.NDArray[np.int64]:
+        """The sounds of a clip of the corpus; its table is read once."""
+        if index not in self._sounds:
+            clip, path = self.clips[index]
+            self._sounds[index] = sounds_in_frames(read_phonemes(path), self.corpus.frames(clip), self.frame_rate)
+        return self._sounds[index]
+
+    def _stretch(self, speech: npt.NDArray[np.float32], start: int, stop: int) -> Tensor:
+        """Samples of a recording from one frame to another."""
+        first, last = (samples_for(frame, self.frame_rate) for frame in (start, stop))
+        return torch.from_numpy(speech[first:last])
+
+    def _augmented(self, speech: Tensor, seed: int) -> Tensor:
         if self.augmenter is None:
-            return np.array(speech, np.float32)
-        nothing = np.zeros((1, 0), np.float32)
-        example = Example(np.array(speech, np.float32), nothing, self.frame_rate, nothing[0], nothing[0])
-        return self.augmenter(example, seed).speech
-
-
-MOST = 100
-"""Recordings of a speaker that are used."""
+            return speech
+        return torch.from_numpy(self.augmenter.change_speech(speech.numpy(), seed))

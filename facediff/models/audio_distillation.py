@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
-from facediff.data.augmentation import Augmenter, Example, SpeechAugmentation, read_augmentations
+from facediff.data.augmentation import Augmenter, SpeechAugmentation, read_augmentations
 from facediff.errors import FaceDiffError, refuse_idle
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
@@ -379,11 +379,7 @@ class SpeechPairs(Dataset[DistillationBatch]):
 
     def _augmented(self, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
         """Speech of the same length in another voice, another room or with noise."""
-        nothing = np.zeros((1, 1, 3), np.float32)
-        example = Example(
-            speech, nothing, len(nothing) * SAMPLE_RATE / max(1, len(speech)), nothing[0], nothing[0, :, 0]
-        )
-        return self.augmenter(example, int(random.integers(2**31))).speech
+        return self.augmenter.change_speech(speech, int(random.integers(2**31)))
 
 
 def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:

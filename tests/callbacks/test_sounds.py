@@ -62,6 +62,10 @@ def test_pieces_are_peoples_and_the_corpuss_in_turn(recordings: Path, two_clips:
     (place,) = [start for start in starts if np.array_equal(whole[0][start : start + 16_000], piece)]
     assert np.array_equal(whole[1][place // 640 : place // 640 + 25], batch.sounds[0].numpy())
     assert (batch.sounds != IGNORED).all()
+    clips = [clip for clip in data.clips("train") if clip.identity == "F1"]
+    whole = [data.corpus.read_audio(clip, 0, data.corpus.frames(clip)).numpy() for clip in clips]
+    windows = [speech[start : start + 16_000] for speech in whole for start in range(0, len(speech) - 16_000 + 1, 640)]
+    assert all(any(np.array_equal(window, batch.audio[k].numpy()) for window in windows) for k in (1, 3))
 
 
 def test_the_encoder_learns_the_sounds_and_nothing_else_changes(
