@@ -43,6 +43,7 @@ import facediff
 from facediff.animation.options import GROUPS
 from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
+from facediff.data.track.face import pair_distances
 from facediff.evaluation.articulation import MouthMotion, by_speaker, mouth_motion
 from facediff.speech.audio import fit_length
 from facediff.speech.espeak import Utterance
@@ -266,9 +267,7 @@ class Bench:
 
     def opening(self, vertices: Array) -> Array:
         """Opening of the mouth (T,)."""
-        return np.asarray(
-            np.linalg.norm(vertices[:, self.pairs[:, 0]] - vertices[:, self.pairs[:, 1]], axis=-1).mean(1)
-        )
+        return pair_distances(vertices, self.pairs)
 
     def squared_error(self, made: Array, true: Array) -> Array:
         """Largest squared error of a lip vertex in each frame (T,)."""
@@ -317,8 +316,9 @@ class Bench:
             made, template = self.animate(speech, sample), sample.template.double().numpy() * 1000
             mouths.setdefault(name, []).append(mouth_motion(made, template, self.pairs, **facts))
         found = by_speaker(mouths)
-        _, low, high = found["closure_auc"]
-        return {**{name: mean for name, (mean, _, _) in found.items()}, "AUC ±": (high - low) / 2, "n": len(mouths)}
+        _, interval = found["closure_auc"]
+        half = (interval.high - interval.low) / 2 if interval else float("nan")
+        return {**{name: mean for name, (mean, _) in found.items()}, "AUC ±": half, "n": len(mouths)}
 
     def spoken(self, samples: Sequence[Sample], change: Change) -> tuple[Array, Array, Array, Array]:
         """Of each closure: whether the lips close, by chance, and the gap in mm; of each frame: the squared error."""

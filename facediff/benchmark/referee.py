@@ -151,9 +151,8 @@ class RefereeScores:
         closed = [(start, end) for start, end in closures(timed, self.frame_rate) if end <= frames]
         if self.jaw is None:
             for found, vertices in ((self._mouths, points), (self._true_mouths, true)):
-                rest, pairs = self.face.rest, self.face.lip_pairs
-                of_clip = {"millimetres": 1000.0, "frame_rate": self.frame_rate, "phonemes": timed}
-                found.append(mouth_motion(vertices, rest, pairs, **of_clip))  # type: ignore[arg-type]
+                rest, pairs, rate = self.face.rest, self.face.lip_pairs, self.frame_rate
+                found.append(mouth_motion(vertices, rest, pairs, millimetres=1000, frame_rate=rate, phonemes=timed))
         if self._closures and closed:
             for name in ("", clip.language):
                 self._closures[name].update(predicted, target, closures=closed)

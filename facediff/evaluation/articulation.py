@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
+from facediff.data.track.face import pair_distances
+from facediff.reporting.statistics import Bootstrap, Interval, pooled
 from facediff.speech.phonemes import TimedPhoneme, closing
 
 Array = npt.NDArray[np.float64]
@@ -71,18 +73,15 @@ def mouth_motion(
         frame_rate: frames a second.
         phonemes: of the speech.
     """
-    upper, lower = np.asarray(lip_pairs).T
-    order = np.argsort(template[upper, 0])
-    right, left = upper[order[0]], upper[order[-1]]
+    upper = np.asarray(lip_pairs)[:, 0]
+    sideways = template[upper, 0]
+    corners = [(upper[sideways.argmin()], upper[sideways.argmax()])]
 
-    def gaps(faces: npt.NDArray[np.floating]) -> Array:
-        return np.asarray(np.linalg.norm(faces[..., upper, :] - faces[..., lower, :], axis=-1).mean(-1), np.float64)
+    def beyond_rest(pairs: npt.ArrayLike) -> Array:
+        moving, resting = (np.asarray(pair_distances(faces, pairs), np.float64) for faces in (vertices, template[None]))
+        return millimetres * (moving - resting)
 
-    def widths(faces: npt.NDArray[np.floating]) -> Array:
-        return np.asarray(np.linalg.norm(faces[..., left, :] - faces[..., right, :], axis=-1), np.float64)
-
-    gap, width = (millimetres * (of(vertices) - of(template)) for of in (gaps, widths))
-    return MouthMotion(gap, width, frame_rate, phonemes)
+    return MouthMotion(beyond_rest(lip_pairs), beyond_rest(corners), frame_rate, phonemes)
 
 
 @dataclass(frozen=True)
@@ -143,28 +142,14 @@ def articulation(recordings: Sequence[MouthMotion]) -> ArticulationScores:
     )
 
 
-def by_speaker(
-    recordings: Mapping[str, Sequence[MouthMotion]], *, seed: int = 0
-) -> dict[str, tuple[float, float, float]]:
-    """Mean over speakers and 95 % interval of each score, by speakers drawn again with replacement (NaN: left out).
-
-    Args:
-        recordings: of each speaker.
-        seed: of the draws.
-    """
-    rows = [articulation(each) for each in recordings.values()]
-    random = np.random.default_rng(seed)
-    drawn = random.integers(len(rows), size=(1000, len(rows)))
-    found = {}
-    for field in fields(ArticulationScores):
-        column = np.array([getattr(row, field.name) for row in rows])
-        if np.isnan(column).all():
-            continue
-        counts = (~np.isnan(column[drawn])).sum(1)
-        means = np.nansum(column[drawn], axis=1)[counts > 0] / counts[counts > 0]
-        low, high = np.quantile(means, [0.025, 0.975]).tolist()
-        found[field.name] = (float(np.nanmean(column)), low, high)
-    return found
+def by_speaker(recordings: Mapping[str, Sequence[MouthMotion]]) -> dict[str, tuple[float, Interval | None]]:
+    """Mean over speakers and 95 % interval of each score that any of them has; no interval of a single speaker."""
+    values = np.array([astuple(articulation(each)) for each in recordings.values()])
+    weights = np.isfinite(values).astype(np.float64)
+    values = np.nan_to_num(values)
+    intervals = Bootstrap().intervals(Bootstrap().scores(values, weights), values.shape[1])
+    means = zip(fields(ArticulationScores), pooled(values, weights).tolist(), intervals, strict=True)
+    return {field.name: (mean, interval) for field, mean, interval in means if not math.isnan(mean)}
 
 
 def area_under_curve(higher: Array, lower: Array) -> float:

@@ -75,11 +75,13 @@ def test_area_under_curve_is_the_share_of_pairs() -> None:
 
 def test_speakers_count_alike_and_their_interval_holds_the_mean() -> None:
     found = by_speaker({"a": [motion()] * 5, "b": [motion(0.5)], "c": [motion(0.8)]})
-    mean, low, high = found["open_vowels"]
+    mean, interval = found["open_vowels"]
     assert mean == pytest.approx(8.0 * 2.3 / 3)
-    assert low < mean < high
-    assert low >= 4.0
-    assert high <= 8.0
+    assert interval is not None
+    assert interval.low < mean < interval.high
+    assert interval.low >= 4.0
+    assert interval.high <= 8.0
+    assert by_speaker({"a": [motion()]})["open_vowels"] == (pytest.approx(8.0), None)
     assert "contact" not in found
 
 
