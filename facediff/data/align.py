@@ -7,11 +7,11 @@ pauses into pieces that a corpus can use.
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, counted, needs_extra
 from facediff.speech.audio import read_speech, write_wav
+from facediff.speech.phonemes import closing
 from facediff.speech.text_grids import SILENCES, WORDS, Interval, find_tier, phones_in, read_text_grid, write_text_grid
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.batch import FileTask, Recipe, run_batch
@@ -47,16 +48,16 @@ class AlignmentReport:
     out: Path
     speakers: dict[str, int]  # pieces of each speaker
     seconds: float
-    phones: Counter[str]
+    phones: int
+    closures: int  # phones at which the lips close
     failed: dict[str, str]
 
     def lines(self) -> list[str]:
         """The report, a line each."""
-        closing_lips = sum(self.phones[name] for name in ("P", "B", "M", "p", "b", "m"))
         total = f"{counted(len(self.speakers), 'speaker')}, {counted(sum(self.speakers.values()), 'piece')}"
         return [
-            f"{self.out}: {total}, {self.seconds / 60:.1f} min; {counted(sum(self.phones.values()), 'phone')}, "
-            f"{closing_lips} of them p, b or m",
+            f"{self.out}: {total}, {self.seconds / 60:.1f} min; {counted(self.phones, 'phone')}, "
+            f"{self.closures} of them p, b or m",
             *(f"not used: {problem}" for problem in self.failed.values()),
         ]
 
@@ -103,7 +104,7 @@ def align_recordings(
         (out / task.output.parent.name).mkdir(exist_ok=True)
     options: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "writes": out, "reads": [source]}
     options["progress"] = "aligning" if progress else ""
-    with closing(run_batch(PerWorker(Aligner), pending, record=FileTask.record, **options)) as outcomes:
+    with contextlib.closing(run_batch(PerWorker(Aligner), pending, record=FileTask.record, **options)) as outcomes:
         failed = {str(task): outcome.problem for task, outcome in outcomes if outcome.problem}
     if len(failed) == len(tasks):
         raise FaceDiffError(next(iter(failed.values())))
@@ -112,15 +113,16 @@ def align_recordings(
 
 def _report(out: Path, failed: dict[str, str]) -> AlignmentReport:
     speakers: Counter[str] = Counter()
-    phones: Counter[str] = Counter()
+    phones = closures = 0
     seconds = 0.0
     for grid in sorted(out.glob("*/*.TextGrid")):
         if grid.parent.name != ALIGNMENTS:
             intervals = phones_in(grid)
             speakers[grid.parent.name] += 1
-            phones.update(re.sub(r"\d$", "", text) for _, _, text in intervals if text.lower() not in SILENCES)
+            labels = [text for _, _, text in intervals if text.lower() not in SILENCES]
+            phones, closures = phones + len(labels), closures + sum(name is not None for name in closing(labels))
             seconds += intervals[-1][1]
-    return AlignmentReport(out, dict(speakers), seconds, phones, failed)
+    return AlignmentReport(out, dict(speakers), seconds, phones, closures, failed)
 
 
 Word = tuple[Interval, list[Interval]]

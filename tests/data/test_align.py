@@ -34,6 +34,7 @@ def test_recordings_are_cut_at_pauses_and_times_stay_right(tmp_path: Path) -> No
     report = align_recordings(tmp_path / "in", tmp_path / "out", workers=1)
     assert not report.failed
     assert report.speakers == {"anna": 3}  # the last 6.6 s have no pause
+    assert 0 < report.closures < report.phones
     whole, _ = soundfile.read(tmp_path / "in" / "anna" / "long.wav")
     times = [3.0, 3.5, 7.1]
     for piece in sorted((tmp_path / "out" / "anna").glob("*.wav")):
