@@ -8,6 +8,7 @@ from pathlib import Path
 
 from facediff.errors import FaceDiffError
 from facediff.utils.files import atomic
+from facediff.utils.plain_files import decoded
 
 PHONES = ("phones", "phone", "phonemes", "phoneme", "mau", "segments", "segment")
 WORDS = ("words", "word", "ort", "ort-mau")
@@ -94,10 +95,8 @@ def read_text_grid(path: Path) -> dict[str, list[Interval]]:
 
 def _decoded(content: bytes) -> str:
     """The text of a file: UTF-8 or UTF-16, and Latin-1 as Praat wrote it once."""
-    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return content.decode("utf-16")
     try:
-        return content.decode("utf-8-sig")
+        return decoded(content)
     except UnicodeDecodeError:
         return content.decode("latin-1")
 

@@ -144,6 +144,11 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], *, line_end: str =
         write_table(temporary, [header, *([row[key] for key in header] for row in rows)], line_end=line_end)
 
 
+def decoded(content: bytes) -> str:
+    """The text of a file from elsewhere: UTF-8, or UTF-16 with its mark."""
+    return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+
+
 def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
     """Rows of a CSV file from elsewhere, as lists of cells; empty lines are none.
 
@@ -156,8 +161,7 @@ def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
         the cells as :func:`csv_text` gives them; the header is the first.
     """
     with damaged(f"{path}: not readable as a UTF-8 table", remedy, OSError, csv.Error):
-        content = path.read_bytes()
-        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        text = decoded(path.read_bytes())
         first, _, rest = text.partition("\n")
         separator = ","
         if (stated := re.fullmatch(r'"?sep=(.)"?\s*', first)) is not None:
