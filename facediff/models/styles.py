@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,7 +102,7 @@ class ModelStyles(StyleReader[Reference | Style]):
     @property
     def width(self) -> int:
         """S: how many numbers a style vector has."""
-        return len(self.still_vector())
+        return len(self._still)
 
     def names(self) -> list[str]:
         """Styles by name, and clips whose motion the checkpoint has."""
@@ -162,6 +163,10 @@ class ModelStyles(StyleReader[Reference | Style]):
 
     def still_vector(self) -> Array:
         """The style vector (S,) of a face that keeps still."""
+        return self._still
+
+    @cached_property
+    def _still(self) -> Array:
         return still_style(self.model).numpy()
 
     def encode(self, name: str, offsets: Array) -> Reference:
