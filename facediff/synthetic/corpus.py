@@ -452,16 +452,15 @@ def _refuse_other(root: Path, facts: dict[str, object]) -> None:
     if not root.is_dir() or not any(root.iterdir()):
         return
     manifest = read_json(root / MANIFEST) or {}
+    faults = [
+        f"holds the corpus with {name} {quoted(manifest.get(name))}, not {quoted(facts[name])}; ask for the same,"
+        for name in ("seed", "drawn", "people")
+        if manifest.get("whole") and manifest.get(name) != facts[name]
+    ]
     if manifest.get("corpus") != facts["corpus"]:
-        raise FaceDiffError(
-            f"{root}: is not empty and holds no manifest of the built-in corpus; choose another folder, or remove it"
-        )
-    for name in ("seed", "drawn", "people") if manifest.get("whole") else ():
-        if manifest.get(name) != facts[name]:
-            raise FaceDiffError(
-                f"{root}: holds the corpus with {name} {quoted(manifest.get(name))}, not {quoted(facts[name])}; ask "
-                f"for the same, choose another folder, or remove this one"
-            )
+        faults = ["is not empty and holds no manifest of the built-in corpus;"]
+    if faults:
+        raise FaceDiffError(f"{root}: {faults[0]} choose another folder, or remove this one")
 
 
 def _write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:
