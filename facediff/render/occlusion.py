@@ -17,6 +17,8 @@ CELLS = 96  # Cells of a depth map along the longest side of the mesh
 AXES = 24  # Lines of sight, each of which is looked along both ways
 LIFT = 0.5  # Depth, in cells, that a surface may lie in front of a vertex without hiding it
 KEPT = 0.4  # Light that is left where nothing of the sky is seen: it comes from the skin around
+HIDDEN = 0.1  # A piece that nowhere sees more of the sky than this lies inside the mesh
+THROUGH_OPENING = 0.45  # Share of the sky that the edge of upper teeth sees between open lips
 
 
 def sky_seen(vertices: npt.NDArray[np.floating[Any]], faces: npt.NDArray[np.integer[Any]]) -> Float64:
@@ -73,7 +75,17 @@ def occlusion(vertices: npt.NDArray[np.floating[Any]], faces: npt.NDArray[np.int
 @lru_cache(maxsize=32)
 def _remembered(points: bytes, triangles: bytes) -> npt.NDArray[np.float32]:
     faces: Faces = np.frombuffer(triangles, np.int32).reshape(-1, 3)
-    return np.asarray(KEPT + (1 - KEPT) * sky_seen(np.frombuffer(points, np.float32).reshape(-1, 3), faces), np.float32)
+    seen = sky_seen(np.frombuffer(points, np.float32).reshape(-1, 3), faces)
+    seen[_inside(seen, faces)] = THROUGH_OPENING  # such pieces are seen only once a mouth opens
+    return np.asarray(KEPT + (1 - KEPT) * seen, np.float32)
+
+
+def _inside(seen: Float64, faces: Faces) -> npt.NDArray[np.bool_]:
+    """Whether each vertex (V,) is of a piece inside a mesh at rest, as teeth are: nothing of it sees the sky."""
+    outside, count = seen > HIDDEN, -1
+    while count != (count := int(outside.sum())):
+        outside[faces[outside[faces].any(axis=1)]] = True
+    return ~outside
 
 
 def lines_of_sight(count: int) -> Float64:

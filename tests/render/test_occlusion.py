@@ -8,6 +8,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from facediff.render.occlusion import KEPT, lines_of_sight, occlusion, sky_seen
+from facediff.synthetic.head.parts import build_head
+from facediff.synthetic.head.rig import head_shapes
 
 Array = NDArray[np.float64]
 
@@ -70,3 +72,22 @@ def test_size_and_mirror_change_nothing() -> None:
     axes = lines_of_sight(24)
     assert np.allclose(np.linalg.norm(axes, axis=1), 1.0)
     assert np.abs(axes.mean(axis=0) * [1, 0, 1]).max() < 0.1
+
+
+def test_teeth_have_the_light_of_an_open_mouth_and_no_other_place_has() -> None:
+    head, shapes = build_head(), head_shapes()
+    light = occlusion(head.vertices, head.faces)
+    smile = {
+        "jawOpen": 0.3,
+        "mouthSmileLeft": 0.6,
+        "mouthSmileRight": 0.6,
+        "mouthUpperUpLeft": 0.5,
+        "mouthUpperUpRight": 0.5,
+    }
+    opened = head.vertices + sum(weight * shapes[name] for name, weight in smile.items())
+    teeth = head.groups["teeth_upper_middle"][:6]  # in front
+    assert np.abs(light[teeth] - (KEPT + (1 - KEPT) * sky_seen(opened, head.faces)[teeth])).max() < 0.15
+    others = np.setdiff1d(np.arange(len(light)), head.both("teeth_", "tongue_"))
+    expected = KEPT + (1 - KEPT) * sky_seen(head.vertices, head.faces)
+    assert np.allclose(light[others], expected[others])
+    assert expected[teeth].max() < KEPT + 0.05  # with the mouth shut

@@ -167,12 +167,14 @@ def test_the_heat_map_is_the_distance_from_the_truth(show: Show) -> None:
 
 
 def test_the_page_has_the_same_occlusion_as_pictures(show: Show) -> None:
-    shape = trimesh.creation.torus(0.05, 0.02, 24, 12)
+    ring, ball = trimesh.creation.torus(0.05, 0.02, 24, 12), trimesh.creation.icosphere(1, 0.01)
+    shape = trimesh.util.concatenate([ring, ball.apply_translation([0.05, 0.0, 0.0])])  # the ball lies in the ring
     template, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.int32)
-    ring = Animation(name="ring", vertices=template[None], template=template, faces=faces, frame_rate=25.0, unit="m")
-    sky = show([ring]).evaluate("[...facediff.sky(0)]")
+    still = Animation(name="ring", vertices=template[None], template=template, faces=faces, frame_rate=25.0, unit="m")
+    sky = show([still]).evaluate("[...facediff.sky(0)]")
     assert np.allclose(sky, occlusion(template, faces), atol=0.02)
     assert min(sky) < 0.8
+    assert np.allclose(sky[-42:], 0.67)
 
 
 def test_names_from_files_cannot_become_scripts_and_no_other_code_runs(show: Show) -> None:

@@ -86,7 +86,18 @@ function skyLight(points, faces) {
       triangles[faces[corner]] += 1;
     }
   }
-  return Float32Array.from(around, (sum, vertex) => (triangles[vertex] ? kept + ((1 - kept) * sum) / triangles[vertex] : 1));
+  const light = around.map((sum, vertex) => (triangles[vertex] ? sum / triangles[vertex] : 1));
+  const outside = light.map((value) => value > 0.1);
+  for (let grows = true; grows; ) {
+    grows = false;
+    for (let i = 0; i < faces.length; i += 3) {
+      const count = outside[faces[i]] + outside[faces[i + 1]] + outside[faces[i + 2]];
+      if (count === 0 || count === 3) continue;
+      outside[faces[i]] = outside[faces[i + 1]] = outside[faces[i + 2]] = 1;
+      grows = true;
+    }
+  }
+  return Float32Array.from(light, (value, vertex) => kept + (1 - kept) * (outside[vertex] ? value : 0.45));
 }
 
 /** Points on the triangles (3 n) that are nowhere further apart than a cell. */
