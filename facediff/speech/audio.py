@@ -131,14 +131,27 @@ def _read(source: Path | IO[bytes], name: str, max_seconds: float | None) -> tup
         if not readable:
             return _decode_container(stream, name, max_seconds, refusal)
         with open_sound(stream, name) as sound:
-            form = str(sound.format)
             try:
-                return _decoded(sound, name, max_seconds)
+                samples, rate = _decoded(sound, name, max_seconds)
             except LostSamplesError as error:
+                if sound.format != "OGG":
+                    raise
                 refusal = error
-        if form != "OGG":
-            raise refusal
+            else:
+                return _from_zero(samples, rate, stream, name, max_seconds), rate
         return _decode_container(stream, name, max_seconds, refusal)  # times of packets tell where it has holes
+
+
+def _from_zero(samples: Samples, rate: int, stream: IO[bytes], name: str, limit: float | None) -> Samples:
+    """The same; of an Ogg file with silence for the beginning that it lacks by the time at which its last page ends."""
+    stream.seek(0)
+    with _map_content(stream) as data:
+        late = round(_ogg_end(data) * rate) - len(samples)
+    if not HOLE * rate < late <= LONGEST_HOLE * rate:
+        return samples
+    _check_length(name, (late + len(samples)) / rate, limit)
+    note(f"{name}: {late / rate:.2f} s of its sound are missing by its times, and are silence")
+    return np.pad(samples, (late, 0))
 
 
 class LostSamplesError(FaceDiffError):
@@ -404,7 +417,7 @@ def _first_time(container: Any, sound: float) -> float:  # noqa: ANN401 - PyAV's
         return float(
             next((video.start_time * video.time_base for video in container.streams.video if video.start_time), 0)
         )
-    zero_based = {"mp4", "matroska"} & {*container.format.name.split(",")} and sound < LONGEST_HOLE
+    zero_based = {"mp4", "matroska", "ogg"} & {*container.format.name.split(",")} and sound < LONGEST_HOLE
     return 0.0 if zero_based else sound
 
 
@@ -423,8 +436,8 @@ def read_stretch(
         if complete is not None:
             complete.add(path)
     with suppress(FaceDiffError), open_sound(path) as file:
-        # Samples in floating point may go beyond 1, by which all of them are divided.
-        is_plain = file.channels == 1 and file.seekable() and file.subtype not in ("FLOAT", "DOUBLE")
+        # Samples in floating point may go beyond 1, by which all of them are divided; an Ogg may have holes.
+        is_plain = file.channels == 1 and file.seekable() and file.subtype not in ("FLOAT", "DOUBLE", "VORBIS", "OPUS")
         if is_plain and file.samplerate == SAMPLE_RATE and file.frames:
             file.seek(min(first, file.frames))
             return fit_length(file.read(length, dtype="float32"), length)
@@ -664,6 +677,21 @@ def _ogg(data: mmap.mmap | bytes) -> str | None:
             return "its last page is incomplete"
         last, at = bool(data[at + 5] & 4), end
     return None if last else "its last page is missing"
+
+
+def _ogg_end(data: mmap.mmap | bytes) -> float:
+    """Seconds at which the first stream of an Ogg file ends by its last page; 0 if it is neither Vorbis nor Opus."""
+    if data[:4] != b"OggS":
+        return 0.0
+    packet, at, end = 27 + data[26], len(data), -1
+    while end < 0 < at:  # pages of other streams do not count, nor those on which no packet ends
+        at = data.rfind(b"OggS", 0, at)
+        if data[at + 14 : at + 18] == data[14:18]:
+            (end,) = struct.unpack_from("<q", data, at + 6)
+    head = data[packet : packet + 19]
+    if head.startswith(b"OpusHead"):
+        return (end - struct.unpack_from("<H", head, 10)[0]) / 48_000
+    return end / max(1, struct.unpack_from("<I", head, 12)[0]) if head.startswith(b"\x01vorbis") else 0.0
 
 
 def _boxes(data: mmap.mmap | bytes) -> str | None:
