@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import inspect
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torchmetrics import Metric
 
 from facediff import metrics as fm
 from facediff.metrics import Coverage, SequenceMetric
+from tests.metrics.further_cases import CASES, pair_batch
 
 
 def motion(batch: int = 2, frames: int = 5, vertices: int = 4) -> Tensor:
@@ -120,3 +124,71 @@ def test_misfits_are_refused_and_nothing_is_added(kind: str, change: dict[str, A
 def test_options_without_a_meaning_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises(ValueError, match=r"expected|known are|squared"):
         make()
+
+
+Corpus = Any  # the class of that name in conftest.py
+Batch = Callable[[Corpus], dict[str, Any]]
+PLACES = [2, 0, 3]
+PAIR: Batch = partial(pair_batch, places=PLACES, extra=0)
+GALLERY = fm.SpeakerGallery(torch.rand(4, 40, 3, generator=torch.Generator().manual_seed(0)), (0, 0, 1, 1))
+LIDS = [(3, 9), (31, 4)]
+
+
+def speaker_batch(corpus: Corpus) -> dict[str, Any]:
+    """Predictions, and whom they should show."""
+    batch = PAIR(corpus)
+    return {"prediction": batch["prediction"], "identities": [0, 1, 1], "lengths": batch["lengths"]}
+
+
+EVERY: dict[str, tuple[Callable[[], Any], Batch]] = {
+    **{case.name: (case.make, lambda corpus, case=case: case.arguments(corpus, PLACES, 0)) for case in CASES},
+    "VertexError": (fm.VertexError, PAIR),
+    "ShannonIndex": (partial(fm.ShannonIndex, [0, 1]), PAIR),
+    "BlinkRate": (partial(fm.BlinkRate, LIDS, frames_per_second=25), PAIR),
+    "BlinkRateRatio": (partial(fm.BlinkRateRatio, LIDS), PAIR),
+    "EyelidDrift": (partial(fm.EyelidDrift, LIDS), PAIR),
+    "NearestSpeakerAccuracy": (partial(fm.NearestSpeakerAccuracy, GALLERY), speaker_batch),
+    "StyleRetrievalAccuracy": (fm.StyleRetrievalAccuracy, lambda _: RIGHT["labels"]),
+    "RealTimeFactor": (
+        partial(fm.RealTimeFactor, "one core"), lambda _: dict.fromkeys(("computing", "speech"), torch.ones(3)),
+    ),
+}  # fmt: skip
+
+
+def faults(batch: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The same batch with one fault each, in its last sequence where that is possible."""
+    for name, value in batch.items():
+        yield {key: other for key, other in batch.items() if key != name}
+        yield batch | {name: value[:-1]}
+        if isinstance(value, Tensor) and value.is_floating_point():
+            ruined = value.clone()
+            ruined[-1].view(-1)[0] = NAN
+            yield batch | {name: ruined}
+            for kept in ((..., slice(-1)), (..., slice(-1), slice(None))):
+                yield batch | ({name: value[kept]} if value.ndim > 1 else {})
+        else:
+            yield batch | {name: [*value[:-1], 10**6]}
+    narrow = {name: value[..., :20, :] for name, value in batch.items() if isinstance(value, Tensor) and value.ndim > 2}
+    yield batch | narrow  # all of a smaller mesh
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_refused_batch_leaves_every_state_as_it_was(name: str, corpus: Corpus) -> None:
+    make, arguments = EVERY[name]
+    batch = arguments(corpus)
+    metric = make()
+    metric.update(**batch)
+    refused = 0
+    for fault in faults(batch):
+        before = copy.deepcopy(metric.metric_state)
+        try:
+            metric.update(**fault)
+        except Exception:  # noqa: BLE001 - of whatever kind
+            refused += 1
+            torch.testing.assert_close(metric.metric_state, before, rtol=0, atol=0, equal_nan=True)
+    assert refused > 2
+
+
+def test_every_metric_is_given_faults() -> None:
+    classes = [kind for kind in vars(fm).values() if inspect.isclass(kind) and issubclass(kind, Metric)]
+    assert {type(make()) for make, _ in EVERY.values()} == {kind for kind in classes if not inspect.isabstract(kind)}
