@@ -76,6 +76,7 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
     materials, nodes = glb.entries("materials"), placed_nodes(glb)
     read: dict[int, list[tuple[dict[str, Any], Array, npt.NDArray[np.int64]]]] = {}  # several nodes may show a mesh
     skins: dict[int, Array] = {}
+    skinned: dict[tuple[int, int], Array | None] = {}
     for mesh, node in _shown(glb, nodes):
         entry = {} if node < 0 else glb.entry("nodes", node)
         if mesh not in read:
@@ -92,7 +93,10 @@ def placed_parts(glb: Glb) -> Iterator[Placed]:
                 if number not in skins:
                     skins[number] = _stands(glb, number, nodes)
                 if len(skins[number]):
-                    matrix = _skinned(glb, skins[number], primitive, len(local))
+                    key = number, id(primitive)
+                    if key not in skinned:
+                        skinned[key] = _skinned(glb, skins[number], primitive, len(local))
+                    matrix = skinned[key]
             # A scale below zero turns a mesh inside out; its triangles are reversed so that they face outwards again. A
             # skin has a matrix per vertex, of which the mean decides.
             mirrored = matrix is not None and np.linalg.det(matrix[..., :3, :3].reshape(-1, 3, 3).mean(axis=0)) < 0

@@ -14,6 +14,7 @@ from facediff.animation import Animation
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb
+from facediff.mesh.glb_scene import placed_parts
 from tests.fakes.glb_targets import pack
 from tests.fakes.meshes import relief
 
@@ -159,3 +160,42 @@ def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:
     (channel,) = animation["channels"]
     assert new.content["nodes"][channel["target"]["node"]] == {"mesh": 1}
     assert new.content["scenes"][new.content["scene"]]["nodes"] == [1, 0]
+
+
+def test_each_skinned_node_of_one_mesh_stands_and_moves_by_its_own_skin(tmp_path: Path) -> None:
+    avatar(tmp_path / "avatar.glb")
+    glb = opened(tmp_path / "avatar.glb")
+    content, first = glb.content, len(glb.content["nodes"])
+    content["nodes"] += [
+        {"name": "far", "translation": [5, 0, 0], "scale": [2, 2, 2]},
+        {"name": "turned", "translation": [0, 7, 0], "rotation": [0, 0.6, 0, 0.8]},
+        *({"name": f"twin {skin}", "mesh": 0, "skin": skin, "translation": [99, 0, 0]} for skin in (1, 2, 1)),
+    ]
+    content["skins"] += [{"joints": [first]}, {"joints": [first + 1, first]}]
+    content["scenes"][0]["nodes"] += range(first, first + 5)
+    (tmp_path / "twins.glb").write_bytes(pack(content, glb.binary))
+    mesh = read_mesh(tmp_path / "twins.glb")
+    local = glb.positions(glb.primitives(0)[0])
+    turn = np.array([[0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, 0.28]])
+    expected = {1: 2 * local + [5, 0, 0], 2: local @ turn.T + [0, 7, 0]}
+    begins, before = {}, 0
+    for part in placed_parts(opened(tmp_path / "twins.glb")):
+        begins[part.node], before = before, before + len(part.local)
+    vertices = np.repeat(mesh.vertices[None].astype(np.float32), 4, axis=0)
+    for node in range(first + 2, first + 5):
+        rows = slice(begins[node], begins[node] + len(local))
+        np.testing.assert_allclose(mesh.vertices[rows], expected[content["nodes"][node]["skin"]], atol=1e-6)
+        vertices[1:, rows] += np.random.default_rng(node).normal(0, 1, (3, len(local), 3)).astype(np.float32)
+    animation = Animation("twins", vertices, vertices[0], 25.0, faces=mesh.faces, unit="mm")
+    add_to_glb(tmp_path / "out.glb", tmp_path / "twins.glb", animation, 0.001)
+    new = opened(tmp_path / "out.glb")
+    motion = new.content["animations"][0]
+    rows_of = {each["target"]["node"]: motion["samplers"][each["sampler"]]["output"] for each in motion["channels"]}
+    for part in placed_parts(new):
+        weights = new.entry("meshes", part.mesh).get("weights", [])
+        moves = [new.numbers(each["POSITION"], "VEC3", ("f4",)) for each in new.entries("targets", part.primitive)]
+        played = np.zeros((4, len(weights)))
+        if part.node in rows_of:
+            played = new.numbers(rows_of[part.node], "SCALAR", ("f4",)).reshape(4, -1) - np.array(weights)
+        shown = part.points + (part.turned(np.einsum("tk,kvc->tvc", played, moves)) if moves else np.zeros((4, 1, 1)))
+        np.testing.assert_allclose(shown, vertices[:, begins[part.node] :][:, : len(part.local)], atol=5e-3)
