@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import zip_longest
@@ -141,7 +142,7 @@ def rows_of(plan: BenchmarkPlan) -> list[Row]:
             label = variant.label if single else f"{method.label}, {variant.label}"
             rows.append(Row(name if single else f"{method.name}/{name}", label, method, variant))
     names = [row.name for row in rows]
-    repeated = next((name for name in names if names.count(name) > 1), None)
+    repeated = next((name for name, count in Counter(names).items() if count > 1), None)
     if repeated is not None:
         raise FaceDiffError(f"{plan.file}: {repeated} names two rows; rename the method or the variant")
     check_known(f"{plan.file}: baseline", "row", filter(None, [plan.baseline.removesuffix(MEAN_SUFFIX)]), names)

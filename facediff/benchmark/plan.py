@@ -23,6 +23,9 @@ COSTS = ("weights", "rtf", "training", "memory")
 MEAN_SUFFIX = ".mean"
 """Suffix of a method's further row, the mean of ``model.test_samples`` samples."""
 
+MOST_CELLS = 10_000
+"""Cells that a plan may have; a few numbers and names of a small file multiply into millions."""
+
 Name = Annotated[str, Text(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,60}", "a short name of letters and digits")]
 Line = Annotated[str, Text(r"(?s).*\S.*", "a text")]
 PATH = Text(r"(?=.)[^\0/]{0,180}(/[^\0/]{0,180}){0,99}", "the path of a file, with short names")
@@ -99,6 +102,18 @@ class MethodEntry:
     seeds: Seeds | None = None
     variants: Lines | None = None
     name: str = field(default="", metadata=DERIVED)
+
+    @property
+    def per_seed(self) -> bool:
+        """Whether each seed is a cell of its own: it is trained, or its files are of several trainings."""
+        return self.config is not None or "{seed}" in f"{self.checkpoint} {self.predictions}"
+
+    def count_cells(self, plan: BenchmarkPlan) -> int:
+        """How many cells of a plan it makes, without making them."""
+        variants = plan.variants if self.variants is None else self.variants
+        corpora = plan.corpora if self.corpora is None else self.corpora
+        trained = len(variants) if self.config is not None and variants else 1
+        return trained * len(corpora) * (len(self.seeds or plan.seeds) if self.per_seed else 1)
 
 
 @dataclass(frozen=True)
@@ -206,14 +221,15 @@ def _method(name: str, method: MethodEntry, plan: BenchmarkPlan, path: Path) -> 
     entry = f"{path}: methods.{name}"
     check_known(f"{entry}.corpora", "corpus", method.corpora or (), plan.corpora)
     check_known(f"{entry}.variants", "variant", method.variants or (), plan.variants)
-    per_seed = method.config is not None or "{seed}" in f"{method.checkpoint} {method.predictions}"
     problem = ""
     if [method.config, method.checkpoint, method.predictions].count(None) != 2:
         problem = "expected one of config, checkpoint and predictions"
     elif method.checkpoint is not None and method.options:
         problem = "options are of training, and a checkpoint is trained; use test_options"
-    elif per_seed and not (plan.seeds or method.seeds):
+    elif method.per_seed and not (plan.seeds or method.seeds):
         problem = "is trained, and the plan has no seeds; add `seeds: [0, 1, 2]`, to see the chance between runs"
+    elif (count := sum(each.count_cells(plan) for each in plan.methods.values())) > MOST_CELLS:
+        problem = f"makes {count} cells with the other methods, of {MOST_CELLS} at most; name fewer seeds or variants"
     if problem:
         raise FaceDiffError(f"{entry}: {problem}")
     for config in [method.config, *(step.config for step in method.before.values())]:

@@ -54,6 +54,7 @@ def test_the_plan_of_the_manual_is_accepted(folder: Path) -> None:
     (folder / "plan.yaml").write_text(text)
     plan = read_plan(folder / "plan.yaml", {"biwi": corpus})
     assert {cell.row for cell in cells_of(plan)} == {"ours", "faceformer", "codetalker", "imported", "theirs"}
+    assert len(cells_of(plan)) == sum(method.count_cells(plan) for method in plan.methods.values())
 
 
 def test_a_root_overrides_the_plans_and_must_be_one_of_its_corpora(folder: Path) -> None:
@@ -71,7 +72,19 @@ def test_a_root_overrides_the_plans_and_must_be_one_of_its_corpora(folder: Path)
 def test_plans_that_come_with_facediff_can_be_run(path: Path) -> None:
     plan = read_plan(path)
     check_scores(plan)
-    assert cells_of(plan)
+    assert len(cells_of(plan)) == sum(method.count_cells(plan) for method in plan.methods.values())
+
+
+@pytest.mark.parametrize("count", [100, 101])
+def test_a_plan_of_too_many_cells_is_refused_before_they_are_made(count: int, folder: Path) -> None:
+    seeds, variants = [*range(count)], {f"v{number}": {} for number in range(50)}
+    text = PLAN.replace("seeds: [0, 1]\n", f"seeds: {seeds}\nvariants: {variants}\n")
+    (folder / "plan.yaml").write_text(text)
+    if count > 100:
+        with pytest.raises(FaceDiffError, match="makes 10100 cells with the other methods, of 10000 at most"):
+            read_plan(folder / "plan.yaml")
+    else:
+        read_plan(folder / "plan.yaml")
 
 
 @pytest.mark.parametrize(
