@@ -7,6 +7,7 @@ file beside it, by distributed_worker.py.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -511,160 +512,112 @@ def beat_alignment(corpus: Corpus, place: int, *, of: str) -> tuple[float, float
 def _cases() -> list[Case]:
     cases: list[Case] = []
     subjects, poolings = ("prediction", "truth", "gap"), ("frames", "sequences")
+    lips, upper, pairs, everything = {"lips": LIPS}, {"upper": UPPER}, {"pairs": PAIRS}, range(40)
 
     def add(
         cls: type,
-        twin: Callable[..., Tensor],
-        given: tuple[Any, ...],
+        given: dict[str, Any],
         options: dict[str, Any],
         arguments: Callable[[Corpus, Sequence[int], int], dict[str, Any]],
         expected: Callable[[Corpus], float],
         extra: str = "",
         only_class: dict[str, Any] | None = None,
     ) -> None:
+        """A class and the function of its name, for what is given with some options."""
         words = [cls.__name__, *(str(value) for value in options.values()), extra]
-        make = partial(cls, *given, **options, **(only_class or {}))
+        twin = partial(getattr(fm, re.sub("(?<!^)([A-Z])", r"_\1", cls.__name__).lower()), **given, **options)
+        make = partial(cls, **given, **options, **(only_class or {}))
         cases.append(Case("-".join(filter(None, words)), make, twin, arguments, expected))
 
     for reduction, squared, pooling in product(("mean", "max"), (True, False), poolings):
         shape: dict[str, Any] = {"reduction": reduction, "squared": squared}
         options = shape | {"pooling": pooling}
         expected = pooled(partial(vertex_error, region=UPPER, **shape), pooling)
-        twin: Any = partial(fm.upper_face_vertex_error, upper=UPPER, **options)
-        add(fm.UpperFaceVertexError, twin, (UPPER,), options, pair_batch, expected)
-        expected = pooled(partial(vertex_error, region=range(40), **shape), pooling)
-        add(fm.MeanVertexError, partial(fm.mean_vertex_error, **options), (), options, pair_batch, expected)
+        add(fm.UpperFaceVertexError, upper, options, pair_batch, expected)
+        expected = pooled(partial(vertex_error, region=everything, **shape), pooling)
+        add(fm.MeanVertexError, {}, options, pair_batch, expected)
     for squared, pooling in product((True, False), poolings):
         options = {"squared": squared, "pooling": pooling}
         expected = pooled(partial(vertex_error, region=LIPS, reduction="max", squared=squared), pooling)
-        twin = partial(fm.lip_vertex_error, lips=LIPS, **options)
-        add(fm.LipVertexError, twin, (LIPS,), options, pair_batch, expected)
+        add(fm.LipVertexError, lips, options, pair_batch, expected)
     for sign in ("signed", "absolute"):
         expected = pooled(partial(dynamics_off, sign=sign), "sequences")
-        twin = partial(fm.face_dynamics_deviation, upper=UPPER, sign=sign)
-        add(fm.FaceDynamicsDeviation, twin, (UPPER,), {"sign": sign}, template_batch, expected)
+        add(fm.FaceDynamicsDeviation, upper, {"sign": sign}, template_batch, expected)
     for pooling, (word, batch) in product(poolings, (("absolute", pair_batch), ("offsets", offsets_batch))):
-        options = {"pooling": pooling}
-        twin = partial(fm.mouth_opening_difference, pairs=PAIRS, **options)
         expected = pooled(opening_difference, pooling)
-        add(fm.MouthOpeningDifference, twin, (PAIRS,), options, batch, expected, word)
+        add(fm.MouthOpeningDifference, pairs, {"pooling": pooling}, batch, expected, word)
     for count, of, pooling in product(("frames", "closures"), subjects, poolings):
         shape = {"threshold": 0.3, "count": count, "of": of}
-        options = shape | {"pooling": pooling}
-        twin = partial(fm.bilabial_closure_rate, pairs=PAIRS, **options)
         expected = pooled(partial(closure_rate, **shape), pooling)
-        add(fm.BilabialClosureRate, twin, (PAIRS,), options, closure_batch, expected)
-    twin = partial(fm.lip_warping_distance, lips=LIPS)
-    add(fm.LipWarpingDistance, twin, (LIPS,), {}, late_batch, pooled(warped_distance, "sequences"))
+        add(fm.BilabialClosureRate, pairs, shape | {"pooling": pooling}, closure_batch, expected)
+    add(fm.LipWarpingDistance, lips, {}, late_batch, pooled(warped_distance, "sequences"))
     for at, smoothing, fps in (("extrema", 2.0, None), ("extrema", 0.0, 25), ("path", 0.0, None), ("path", 1.5, 30.0)):
         options = {"at": at, "smoothing": smoothing, "frames_per_second": fps}
         formula: Any = partial(misalignment, at=at, smoothing=smoothing, milliseconds=1000 / fps if fps else 1)
-        twin = partial(fm.temporal_misalignment, pairs=PAIRS, **options)
-        add(fm.TemporalMisalignment, twin, (PAIRS,), options, late_batch, pooled(formula, "sequences"))
+        add(fm.TemporalMisalignment, pairs, options, late_batch, pooled(formula, "sequences"))
     for word, batch in (("absolute", pair_batch), ("offsets", offsets_batch)):
-        twin = partial(fm.lip_opening_correlation, pairs=PAIRS)
-        expected = pooled(opening_correlation, "sequences")
-        add(fm.LipOpeningCorrelation, twin, (PAIRS,), {}, batch, expected, word)
-    twin = partial(fm.lip_speed_correlation, lips=LIPS)
-    add(fm.LipSpeedCorrelation, twin, (LIPS,), {}, pair_batch, pooled(speed_correlation, "sequences"))
+        add(fm.LipOpeningCorrelation, pairs, {}, batch, pooled(opening_correlation, "sequences"), word)
+    add(fm.LipSpeedCorrelation, lips, {}, pair_batch, pooled(speed_correlation, "sequences"))
     for of, (given, batch) in product(subjects, (("intensity", intensity_batch), ("waveform", sound_batch))):
         options = {"of": of} | ({"sample_rate": RATE, "frames_per_second": FPS} if given == "waveform" else {})
-        twin = partial(fm.frame_speech_lip_correlation, lips=LIPS, **options)
         expected = pooled(partial(frame_slcc, of=of, given=given), "sequences")
-        add(fm.FrameSpeechLipCorrelation, twin, (LIPS,), options, batch, expected)
+        add(fm.FrameSpeechLipCorrelation, lips, options, batch, expected)
     for of, n_identities in product(subjects, (1, 2)):
         expected = partial(clip_slcc, of=of, n_identities=n_identities)
-        batch = identity_batch if n_identities > 1 else intensity_batch
-        twin = partial(fm.clip_speech_lip_correlation, lips=LIPS, of=of)
-        add(
-            fm.ClipSpeechLipCorrelation,
-            twin,
-            (LIPS,),
-            {"of": of, "n_identities": n_identities},
-            batch,
-            expected,
-        )
-    for cls, function, make in (
-        (fm.MeanEstimateError, fm.mean_estimate_error, mean_estimate),
-        (fm.CoverageError, fm.coverage_error, coverage),
-    ):
+        batch, only = identity_batch if n_identities > 1 else intensity_batch, {"n_identities": n_identities}
+        add(fm.ClipSpeechLipCorrelation, lips, {"of": of}, batch, expected, str(n_identities), only)
+    several_samples = {"n_samples": SAMPLES}
+    for cls, make in ((fm.MeanEstimateError, mean_estimate), (fm.CoverageError, coverage)):
         for squared, pooling in product((True, False), poolings):
-            options = {"squared": squared, "pooling": pooling}
-            twin = partial(function, lips=LIPS, **options)
             expected = pooled(partial(make, squared=squared), pooling)
-            add(cls, twin, (LIPS,), options, samples_batch, expected, only_class={"n_samples": SAMPLES})
+            options = {"squared": squared, "pooling": pooling}
+            add(cls, lips, options, samples_batch, expected, only_class=several_samples)
     for pairing, pooling, region in product(("shuffled", "all"), poolings, (None, LIPS)):
-        options = {"pairing": pairing, "pooling": pooling}
         # Which halves are compared is tested on its own.
         compared = fm.SampleDiversity(pairing=pairing, n_samples=SAMPLES).pairs(SAMPLES)
-        formula = partial(diversity, pairs=compared, region=region or range(40))
-        twin = partial(fm.sample_diversity, region=region, **options)
-        expected = pooled(formula, pooling)
-        word = "region" if region else ""
-        only = {"n_samples": SAMPLES}
-        add(fm.SampleDiversity, twin, (region,), options, lone_samples_batch, expected, word, only)
+        expected = pooled(partial(diversity, pairs=compared, region=region or everything), pooling)
+        options, word = {"pairing": pairing, "pooling": pooling}, "region" if region else ""
+        add(fm.SampleDiversity, {"region": region}, options, lone_samples_batch, expected, word, several_samples)
     for pooling in poolings:
-        formula = partial(diversity, pairs=list(combinations(range(SAMPLES), 2)), region=range(40))
-        twin = partial(fm.identity_diversity, pooling=pooling)
+        formula = partial(diversity, pairs=list(combinations(range(SAMPLES), 2)), region=everything)
         batch = partial(lone_samples_batch, name="predictions")
-        add(fm.IdentityDiversity, twin, (), {"pooling": pooling}, batch, pooled(formula, pooling))
+        add(fm.IdentityDiversity, {}, {"pooling": pooling}, batch, pooled(formula, pooling))
     for region in (None, LIPS):
-        twin = partial(fm.motion_liveliness, region=region)
-        expected = partial(liveliness, region=region or range(40))
-        word, only = "region" if region else "", {"n_samples": SAMPLES}
-        add(fm.MotionLiveliness, twin, (region,), {}, pair_batch, expected, word)
-        twin, expected = (
-            partial(fm.frame_step, region=region),
-            partial(smoothness, region=region or range(40), of="step"),
-        )
-        add(fm.FrameStep, twin, (region,), {}, pair_batch, expected, word)
+        over, word = region or everything, "region" if region else ""
+        of_region: dict[str, Any] = {"region": region}
+        add(fm.MotionLiveliness, of_region, {}, pair_batch, partial(liveliness, region=over), word)
+        add(fm.FrameStep, of_region, {}, pair_batch, partial(smoothness, region=over, of="step"), word)
         for side in ("share", "prediction", "truth"):
-            twin = partial(fm.difference_ratio, region=region, of=side)
-            expected = partial(smoothness, region=region or range(40), of=side)
-            add(fm.DifferenceRatio, twin, (region,), {"of": side}, pair_batch, expected, word)
+            expected = partial(smoothness, region=over, of=side)
+            add(fm.DifferenceRatio, of_region, {"of": side}, pair_batch, expected, word)
         for octaves in (1, 4):
-            twin = partial(fm.spectrum_distance, region=region, octaves=octaves)
-            expected = partial(decibels_off, octaves=octaves, region=region or range(40))
-            add(fm.SpectrumDistance, twin, (region,), {"octaves": octaves}, pair_batch, expected, word)
-        twin = partial(fm.spread_error_ratio, region=region)
-        expected = partial(spread_over_error, region=region or range(40))
-        add(fm.SpreadErrorRatio, twin, (region,), {}, samples_batch, expected, word, only)
-        twin = partial(fm.spread_error_ratio, region=region, squared=True)
-        expected = partial(variance_over_error, region=region or range(40))
-        add(fm.SpreadErrorRatio, twin, (region,), {"squared": True}, samples_batch, expected, word, only)
+            expected = partial(decibels_off, octaves=octaves, region=over)
+            add(fm.SpectrumDistance, of_region, {"octaves": octaves}, pair_batch, expected, word)
+        for options, ratio in (({}, spread_over_error), ({"squared": True}, variance_over_error)):
+            expected = partial(ratio, region=over)
+            add(fm.SpreadErrorRatio, of_region, options, samples_batch, expected, word, several_samples)
         for of, pooling in product(("frames", "sequences"), poolings):
+            expected = pooled(partial(energy, of=of, region=over), pooling)
             options = {"of": of, "pooling": pooling}
-            twin = partial(fm.energy_score, region=region, **options)
-            expected = pooled(partial(energy, of=of, region=region or range(40)), pooling)
-            add(fm.EnergyScore, twin, (region,), options, samples_batch, expected, word, only)
+            add(fm.EnergyScore, of_region, options, samples_batch, expected, word, several_samples)
+    of_lips = {"region": LIPS}
     for of in subjects:
-        for cls, function, options, score in (
-            (fm.ChannelVariance, fm.channel_variance, {}, variance),
-            (fm.FramePairDistance, fm.frame_pair_distance, {"pairs": 30, "seed": 5}, pair_distance),
+        for cls, options, score in (
+            (fm.ChannelVariance, {}, variance),
+            (fm.FramePairDistance, {"pairs": 30, "seed": 5}, pair_distance),
         ):
-            options = options | {"of": of}
             expected = pooled(partial(one_side, of=of, score=score), "sequences")
-            add(cls, partial(function, region=LIPS, **options), (LIPS,), options, pair_batch, expected)
+            add(cls, of_lips, options | {"of": of}, pair_batch, expected)
         options = {"smoothing": 1.0, "variance": 2.0, "sample_rate": RATE, "frames_per_second": FPS, "of": of}
         expected = pooled(partial(beat_alignment, of=of), "sequences")
-        twin = partial(fm.head_beat_alignment, region=LIPS, **options)
-        add(fm.HeadBeatAlignment, twin, (LIPS,), options, sound_batch, expected)
-    for cls, function, formula in (
-        (fm.ChannelDynamicsDeviation, fm.channel_dynamics_deviation, spread_off),
-        (fm.StepDistance, fm.step_distance, steps_off),
-    ):
-        add(cls, partial(function, region=LIPS), (LIPS,), {}, pair_batch, pooled(formula, "sequences"))
-    twin = partial(fm.lip_dynamics_deviation, pairs=PAIRS)
-    add(fm.LipDynamicsDeviation, twin, (PAIRS,), {}, pair_batch, pooled(opening_spread_off, "sequences"))
-    twin = partial(fm.residual_partner_correlation, region=LIPS)
-    expected = pooled(residual_correlation, "sequences")
-    add(fm.ResidualPartnerCorrelation, twin, (LIPS,), {}, partner_batch, expected)
+        add(fm.HeadBeatAlignment, of_lips, options, sound_batch, expected)
+    for cls, formula in ((fm.ChannelDynamicsDeviation, spread_off), (fm.StepDistance, steps_off)):
+        add(cls, of_lips, {}, pair_batch, pooled(formula, "sequences"))
+    add(fm.LipDynamicsDeviation, pairs, {}, pair_batch, pooled(opening_spread_off, "sequences"))
+    add(fm.ResidualPartnerCorrelation, of_lips, {}, partner_batch, pooled(residual_correlation, "sequences"))
     for partner, region in ((False, LIPS[:1]), (True, LIPS[:2])):
-        options = {"with_partner": partner, "dims": 3}
-        twin = partial(fm.frechet_distance, region=region, **options)
-        batch = partner_batch if partner else pair_batch
-        expected = partial(frechet, partner=partner, region=region)
-        add(fm.FrechetDistance, twin, (region,), options, batch, expected)
+        batch, expected = partner_batch if partner else pair_batch, partial(frechet, partner=partner, region=region)
+        add(fm.FrechetDistance, {"region": region}, {"with_partner": partner, "dims": 3}, batch, expected)
     return cases
 
 
