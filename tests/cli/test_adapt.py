@@ -36,19 +36,6 @@ def adapted(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def second(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkpoint of the second model by the command line."""
-    folder = tmp_path_factory.mktemp("second")
-    words = ["--config", "configs/experiment/puppet_style_content.yaml", "--data=tests.fakes.tiny.Tiny"]
-    words += [f"--data.root={tiny_root}", "--trainer.max_epochs=1", "--trainer.check_val_every_n_epoch=1"]
-    words += ["--model.dim=16", "--model.speech_layers=1", "--model.mesh_encoder.spiral_length=5"]
-    words += ["--trainer.enable_progress_bar=false", f"--trainer.logger.save_dir={folder}"]
-    assert main(["fit", *words]) == 0
-    (path,) = folder.rglob("best.ckpt")
-    return path
-
-
 def error_of_c(path: Path, tiny: Tiny) -> float:
     """Mean squared error of C's test clips, conditioned on C where C is known."""
     model, total = load_model(path), 0.0
@@ -59,16 +46,6 @@ def error_of_c(path: Path, tiny: Tiny) -> float:
         with torch.inference_mode():
             total += float((model.generate(collate([sample]))[0] - sample.motion).square().mean())
     return total
-
-
-@pytest.mark.slow
-def test_new_speaker_comes_first_and_the_others_stay(adapted: Path, checkpoint: Path) -> None:
-    before, after = load_model(checkpoint), load_model(adapted)
-    assert after.identities == ["C", *before.identities]
-    assert after.assets.identity_index("C") == 0
-    assert after.assets.motion_scale == before.assets.motion_scale
-    table = after.network.identity_encoder.coarse.weight
-    assert len(table) == len(before.network.identity_encoder.coarse.weight) + 1
 
 
 def test_new_speaker_starts_as_the_mean_of_the_others() -> None:
@@ -123,13 +100,6 @@ def test_joint_training_uses_the_corpus_too(checkpoint: Path, tmp_path: Path) ->
     assert load_model(path).provenance.items() >= {IMPORTED: "FaceFormer", "parent": "imported.ckpt"}.items()
     printed = read_checkpoint(path)["datamodule_hyper_parameters"]
     assert (printed["extra_identities"], printed["train_identities"]) == (["C"], None)
-
-
-@pytest.mark.slow
-def test_the_second_system_adapts_too(second: Path, tmp_path: Path) -> None:
-    path = tmp_path / "C.ckpt"
-    assert main(["adapt", "--checkpoint", str(second), "--person", "C", "-o", str(path), *FAST]) == 0
-    assert load_model(path).identities[0] == "C"
 
 
 @pytest.mark.parametrize("which", ["checkpoint", pytest.param("second", marks=pytest.mark.slow)])

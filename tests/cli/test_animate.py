@@ -7,7 +7,6 @@ import pickle
 import re
 import shutil
 import signal
-import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -351,65 +350,14 @@ def test_a_stream_of_nothing(rate: str, checkpoint: Path, tmp_path: Path, capsys
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_a_microphone_gives_what_the_file_gives(checkpoint: Path, tmp_path: Path) -> None:
-    """A real pipe: the file's samples, a few at a time."""
-    samples = (0.1 * np.random.default_rng(0).normal(size=16000 * 11)).clip(-1, 1)
-    speech = write(tmp_path / "speech.wav", samples)
-    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "file.npy") == 0
-    pcm = soundfile.read(speech, dtype="int16")[0].astype("<i2").tobytes()
-    words = [sys.executable, "-m", "facediff", "animate", "-", "--stream", "--checkpoint", str(checkpoint), "-o"]
-    with subprocess.Popen(
-        [*words, "-"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert b"look-ahead 4.50 s" in process.stderr.readline()
-        process.stdin.write(pcm[: 2 * 16000 * 6])
-        process.stdin.flush()
-        # Two windows of 4 s, 1 s shared, are certain after 6 s but for what they share: a frame comes before the end.
-        early = process.stdout.read(75 * 24 * 12)
-        process.stdin.write(pcm[2 * 16000 * 6 :])
-        process.stdin.close()
-        late = process.stdout.read()
-        assert process.wait(60) == 0
-        assert b"real-time factor" in process.stderr.read()
-    streamed = np.frombuffer(early + late, "<f4").reshape(-1, 24, 3)
-    np.testing.assert_array_equal(streamed, np.load(tmp_path / "file.npy"))
-    odd = subprocess.run([*words, str(tmp_path / "s.npy"), "--rate", "22050"], input=pcm[:66151], capture_output=True)
-    assert odd.returncode == 0, odd.stderr
-    assert np.load(tmp_path / "s.npy").shape == (round(33075 / 22050 * 25), 24, 3)
-
-
-@pytest.mark.slow
-def test_a_file_sent_as_samples_is_noticed(checkpoint: Path, speech: Path, tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "facediff", "animate", "-", "--stream", "--checkpoint", str(checkpoint)]
-    done = subprocess.run([*words, "-o", str(tmp_path / "x.npy")], input=speech.read_bytes(), capture_output=True)
-    assert done.returncode == 2
-    assert b"holds a sound file, not samples" in done.stderr
+def test_a_stream_at_another_rate_and_a_file_sent_as_samples(
+    checkpoint: Path, speech: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert streamed(pcm(1.5)[:-1], checkpoint, tmp_path / "s.npy", "--rate", "22050") == 0
+    assert np.load(tmp_path / "s.npy").shape == (round(24_000 / 22_050 * 25), 24, 3)
+    assert streamed(speech.read_bytes(), checkpoint, tmp_path / "x.npy") == 2
+    assert "holds a sound file, not samples" in capsys.readouterr().err
     assert not (tmp_path / "x.npy").exists()
-
-
-def test_a_folder_of_recordings(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One bad recording does not stop the others, and what is there is not made again."""
-    (tmp_path / "in").mkdir()
-    rng = np.random.default_rng(1)
-    for name in ("a", "b"):
-        write(tmp_path / "in" / f"{name}.wav", 0.1 * rng.normal(size=16000))
-    (tmp_path / "in" / "c.wav").write_text("no sound")
-    words = [tmp_path / "in", "--checkpoint", checkpoint, "-o", tmp_path / "out", "--suffix", ".npz", "--workers", "1"]
-    assert animate(*words) == 1
-    printed = capsys.readouterr()
-    assert "not a readable sound file" in printed.out + printed.err
-    assert {path.name for path in (tmp_path / "out").glob("*.npz")} == {"a.npz", "b.npz"}
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.npz")}
-    write(tmp_path / "in" / "c.wav", 0.1 * rng.normal(size=16000))
-    assert animate(*words) == 0
-    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
-    assert (tmp_path / "out" / "c.npz").is_file()
-    assert animate(*words[:-4], "--suffix", ".obj") == 2
-    assert "a batch writes one file for each recording" in capsys.readouterr().err
 
 
 def test_samples_are_transferred_to_another_mesh_by_one_correspondence(

@@ -299,6 +299,8 @@ def test_animate_takes_a_folder(
     capsys.readouterr()
     assert main(command) == 1
     assert "3 recordings: 2 up to date, 1 failed" in capsys.readouterr().out
+    assert main([*command[:2], "--suffix", ".obj", "-o", str(out)]) == 2
+    assert "a batch writes one file for each recording" in capsys.readouterr().err
 
 
 def test_a_mesh_without_a_mouth_is_refused_before_a_recording_is_animated(

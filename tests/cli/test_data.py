@@ -98,11 +98,3 @@ def test_an_unfinished_corpus_is_not_trained_on(
     message = capsys.readouterr().err
     assert "prepare.json" in message
     assert "facediff data prepare" in message
-
-
-def test_data_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["data"]) == 2
-    assert main(["data", "--help"]) == 0
-    assert "import-person" in capsys.readouterr().out
-    assert main(["data", "chek", "x"]) == 2
-    assert 'there is no command "data chek": did you mean "check"?' in capsys.readouterr().err

@@ -282,10 +282,6 @@ def test_runs_carry_the_name_of_their_experiment(
     assert first["init_args"]["name"] == expected
 
 
-def test_configs_are_short() -> None:
-    assert all(len(path.read_text().splitlines()) <= 40 for path in CONFIGS.rglob("*.yaml"))
-
-
 @pytest.mark.slow
 def test_sub_configs_and_interpolation_with_a_flag_over_a_file(
     fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -369,45 +365,6 @@ def test_three_processes_score_as_one_does(
                     assert float(other[column]) == pytest.approx(float(value), rel=1e-8)
                 else:
                     assert other[column] == value
-
-
-@pytest.mark.slow
-def test_the_rows_of_the_sequences_add_up_to_the_scores(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["test", "--ckpt_path", str(checkpoint), "--trainer.enable_progress_bar=false"]) == 0
-    tables = {}
-    for name in ("test_scores.csv", "test_sequences.csv"):
-        (path,) = tmp_path.rglob(name)
-        tables[name] = list(csv.DictReader(path.read_text().splitlines()))
-    for total in tables["test_scores.csv"]:
-        keys = ("split", "method")
-        rows = [row for row in tables["test_sequences.csv"] if all(row[key] == total[key] for key in keys)]
-        frames = np.array([int(row["frames"]) for row in rows])
-        assert frames.sum() == int(total["frames"])
-        for name in ("mve", "lve"):
-            values = np.array([float(row[name]) for row in rows])
-            assert (values * frames).sum() / frames.sum() == pytest.approx(float(total[name]), rel=1e-9)
-        assert np.mean([float(row["fdd"]) for row in rows]) == pytest.approx(float(total["fdd"]), rel=1e-9)
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="of glibc")
-def test_freed_memory_is_kept_for_the_next_step() -> None:
-    """Large arrays that come and go cost no page faults; in a process of its own, which returns no memory any more."""
-    program = (
-        "import resource, numpy as np\n"
-        "from facediff.cli.lightning import keep_freed_memory\n"
-        "def faults():\n"
-        "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
-        "    for _ in range(5): np.ones(4_000_000, np.float32)\n"
-        "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before\n"
-        "print(faults(), keep_freed_memory(), faults() and None, faults())"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    before, told, _, after = done.stdout.split()
-    if told == "True":  # another C library has nothing to be told
-        assert int(after) < 0.01 * int(before)
 
 
 def test_loggers_that_another_config_replaces_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

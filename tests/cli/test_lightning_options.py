@@ -140,16 +140,6 @@ def test_the_advice_for_a_corpus_of_ones_own_works(own: Path, capsys: pytest.Cap
     assert Path(following[-1]).is_file()
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.slow
-def test_the_advice_for_scoring_a_corpus_of_ones_own_works(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["test", f"--ckpt_path={own}", "--trainer.enable_progress_bar=false", "--trainer.accelerator=cpu"]
-    assert main(words) == 2
-    assert "my_corpus" not in sys.modules
-    assert main([*words, *advised(capsys.readouterr().err)]) == 0
-    assert list(Path("runs").rglob("test_scores.csv"))
-
-
 def test_a_corpus_that_is_not_there_is_refused_before_the_model_is_built(tmp_path: Path) -> None:
     missing = str(tmp_path / "BIWI")
     with pytest.raises(FaceDiffError, match="BIWI: no such folder"):

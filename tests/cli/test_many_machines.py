@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -19,10 +19,8 @@ from facediff.cli.app import main
 from tests.cli.conftest import SMALL
 from tests.fakes.waiting import free_port
 
-Fit = Callable[..., int]
 ROOT = Path(__file__).parents[2]
 SWEEP = ROOT / "configs" / "sweep" / "puppet.yaml"
-NO_GPU = not torch.cuda.is_available()
 
 
 def sweep_words(**chosen: object) -> list[str]:
@@ -59,17 +57,6 @@ def test_the_sweep_names_options_that_exist_and_a_score_that_is_logged(capsys: p
             assert found == pytest.approx(value)
     monitored = yaml.safe_load((ROOT / "configs/trainer/cpu.yaml").read_text())["callbacks"]
     assert sweep["metric"]["name"] in [found.get("init_args", {}).get("monitor") for found in monitored]
-
-
-@pytest.mark.slow
-def test_a_run_of_the_sweep_trains(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = sweep_words(**{"model.learning_rate": 0.0002, "model.decoder.num_layers": 1})
-    data = ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}"]
-    assert main([*words[1:], *data, *SMALL]) == 0
-    (checkpoint,) = tmp_path.glob("runs/puppet/*/checkpoints/last.ckpt")
-    assert torch.load(checkpoint, weights_only=True)["hyper_parameters"]["learning_rate"] == 0.0002
-    assert list(tmp_path.glob("runs/wandb/offline-run-*/*.wandb"))
 
 
 # Several processes on this machine, which take one another for machines.

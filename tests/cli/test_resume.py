@@ -72,24 +72,6 @@ def whole(fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_run_stopped_by_a_signal_continues_in_its_folder(
-    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    two_epochs = ["--trainer.max_epochs=2", *LONGER[1:]]
-    assert fit(*two_epochs, f"--trainer.logger.save_dir={tmp_path / 'whole'}") == 0
-    whole = tmp_path / "whole" / "puppet" / "version_0"
-    words = [*two_epochs, f"--trainer.logger.save_dir={tmp_path}"]
-    with monkeypatch.context() as patched:
-        stop_at(6, patched, signal.SIGTERM)
-        with pytest.raises(SystemExit):
-            fit(*words)
-    assert fit(*words, "--ckpt_path=last") == 0
-    run = tmp_path / "puppet" / "version_0"
-    assert (curve(run), weights(run), files(run)) == (curve(whole), weights(whole), files(whole))
-    assert "ckpt_path: null" in (run / "config.yaml").read_text()
-
-
-@pytest.mark.slow
 def test_a_run_stopped_by_an_error_and_two_signals_continues_in_its_folder(
     fit: Fit, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
