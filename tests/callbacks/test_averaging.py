@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from facediff.callbacks import EmaWithWarmup
 from facediff.models import DualPathDiffusion
+from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import Tiny
 
 
@@ -60,21 +61,14 @@ def test_the_first_weights_are_forgotten_in_a_short_training() -> None:
     assert averages(weights, warmup=1.0)[-1].min() > 0.9
 
 
-def test_the_average_follows_a_line_at_a_tenth_of_the_steps() -> None:
-    """Weights that grow evenly: the average of n steps lies n / 10 steps behind, until the largest decay is reached."""
-    weights = np.repeat(np.arange(1000, dtype=np.float32)[:, None], 3, 1)
-    found = averages(weights)[:, 0]
-    np.testing.assert_allclose(found[[499, 999]], [450, 900], rtol=0.01)
-
-
 def test_scores_of_a_checkpoint_by_path_are_those_of_the_average(
     make_model: Callable[..., DualPathDiffusion], tiny: Tiny, tmp_path: Path
 ) -> None:
     """After ``fit`` with the same trainer, as users of Lightning write it."""
-    quiet = {f"limit_{part}_batches": 1 for part in ("val", "test", "predict")}
-    quiet |= {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
+    few: dict[str, Any] = {f"limit_{part}_batches": 1 for part in ("val", "test", "predict")}
     best = ModelCheckpoint(tmp_path, monitor="val/loss")
-    trainer = pl.Trainer(max_epochs=2, callbacks=[EmaWithWarmup(decay=0.9), best], **quiet)
+    callbacks = [EmaWithWarmup(decay=0.9), best]
+    trainer = quiet_trainer(tmp_path, max_epochs=2, callbacks=callbacks, enable_checkpointing=True, **few)
     model = make_model()
     trainer.fit(model, datamodule=tiny)
     average = torch.load(best.best_model_path, weights_only=True)["state_dict"]

@@ -21,19 +21,10 @@ from facediff.callbacks.runs import ResumableCSVLogger
 from facediff.data.batch import clips_in
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
+from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import Tiny
 
 pytestmark = pytest.mark.filterwarnings("ignore:Checkpoint directory", "ignore:.*ThroughputMonitor")
-
-TRAINER = {
-    "accelerator": "cpu",
-    "devices": 1,
-    "max_epochs": 3,
-    "enable_progress_bar": False,
-    "enable_model_summary": False,
-    "num_sanity_val_steps": 0,
-    "log_every_n_steps": 1,
-}
 
 
 class Stop(pl.Callback):
@@ -69,9 +60,10 @@ def fit(
     model = make_model(audio_encoder=encoder, **options)
     logger = ResumableCSVLogger(folder, name="run", version=0)
     logger.continues = ckpt_path is not None
-    trainer = pl.Trainer(
+    trainer = quiet_trainer(
+        folder,
         logger=logger,
-        default_root_dir=folder,
+        enable_checkpointing=True,
         callbacks=[
             EmaWithWarmup(decay=0.6, warmup=3.0),
             ModelCheckpoint(monitor="val/lve", filename="best"),
@@ -80,7 +72,7 @@ def fit(
             LastCheckpoint(every_n_steps=every_n_steps),
             *stops,
         ],
-        **{**TRAINER, **trainer_options},  # type: ignore[arg-type]
+        **{"max_epochs": 3, **trainer_options},
     )
     trainer.strategy.checkpoint_io = AtomicCheckpointIO()
     data = data_class(root=str(tiny_root), **{"batch_size": 3, **(data_options or {})})  # type: ignore[arg-type]
@@ -99,18 +91,11 @@ def last(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    return {"folder": tmp_path_factory.mktemp("whole")}
-
-
-@pytest.fixture
 def uninterrupted(
-    whole: dict[str, object], tiny_root: Path, make_model: Callable[..., DualPathDiffusion]
+    tmp_path_factory: pytest.TempPathFactory, tiny_root: Path, make_model: Callable[..., DualPathDiffusion]
 ) -> tuple[dict[str, torch.Tensor], list[dict[str, str]]]:
-    if "weights" not in whole:
-        model, curve = fit(Path(str(whole["folder"])), tiny_root, make_model)
-        whole.update(weights=model.state_dict(), curve=curve)
-    return whole["weights"], whole["curve"]  # type: ignore[return-value]
+    model, curve = fit(tmp_path_factory.mktemp("whole"), tiny_root, make_model)
+    return model.state_dict(), curve
 
 
 @pytest.mark.parametrize(
@@ -139,22 +124,13 @@ def test_a_stopped_run_continues_to_the_same_weights_and_curve(
     tiny_root: Path,
     make_model: Callable[..., DualPathDiffusion],
 ) -> None:
-    weights, curve = uninterrupted
+    (weights, curve), data = uninterrupted, {"num_workers": workers}
     with pytest.raises((RuntimeError, SystemExit)) as stop:
-        fit(
-            tmp_path,
-            tiny_root,
-            make_model,
-            Stop(step, number),
-            every_n_steps=every,
-            data_options={"num_workers": workers},
-        )
+        fit(tmp_path, tiny_root, make_model, Stop(step, number), every_n_steps=every, data_options=data)
     assert number is None or stop.value.code == 128 + number  # type: ignore[union-attr]
     assert last(tmp_path).is_file()
     torch.rand(99)  # whatever happened since must not matter
-    model, continued = fit(
-        tmp_path, tiny_root, make_model, ckpt_path=last(tmp_path), data_options={"num_workers": workers}
-    )
+    model, continued = fit(tmp_path, tiny_root, make_model, ckpt_path=last(tmp_path), data_options=data)
     assert continued == curve
     assert {k: v.tolist() for k, v in model.state_dict().items()} == {k: v.tolist() for k, v in weights.items()}
 

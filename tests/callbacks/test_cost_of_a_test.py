@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from lightning.pytorch import Trainer
@@ -23,8 +22,8 @@ def test_what_a_test_generates_is_told(
     draws: int,
     make_model: Callable[..., DualPathDiffusion],
     tiny: Tiny,
+    make_trainer: Callable[..., Trainer],
     monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
 ) -> None:
     model = make_model(unseen_identity=policy, test_samples=draws)
     model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
@@ -37,10 +36,7 @@ def test_what_a_test_generates_is_told(
 
     monkeypatch.setattr(DualPathDiffusion, "generate", counting)
     monkeypatch.setattr(outputs, "MANY_STEPS", 0)
-    trainer = Trainer(
-        accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False,
-        default_root_dir=tmp_path, callbacks=[outputs.ScoreTable(media_clips=0)], enable_checkpointing=False,
-    )  # fmt: skip
+    trainer = make_trainer(callbacks=[outputs.ScoreTable(media_clips=0)])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", Note)
         trainer.test(model, datamodule=tiny, verbose=False)

@@ -17,13 +17,11 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from lightning.pytorch.callbacks import EMAWeightAveraging
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
 from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, scores
-from facediff.cli.app import main
 from facediff.data import collate
 from facediff.data.corpus import Clip
 from facediff.models import DualPathDiffusion, load_model
@@ -94,27 +92,6 @@ def model_of(checkpoint: Path, *, averaged: bool) -> DualPathDiffusion:
     weights = torch.load(checkpoint, weights_only=True)["state_dict" if averaged else "current_model_state"]
     model.load_state_dict(weights)
     return model
-
-
-@pytest.mark.slow
-def test_preview_shows_averaged_weights(
-    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
-) -> None:
-    """After epoch 2 from validation; after epoch 3, which has none, at the end of training.
-
-    Here the averaging callback comes first; with two processes, below, it comes last.
-    """
-    callbacks = [EMAWeightAveraging(decay=0.9, use_buffers=False), SamplingPreview(**{**SMALL, "clips": 1})]
-    trainer = make_trainer(max_epochs=3, check_val_every_n_epoch=2, callbacks=[*callbacks, Weights(str(tmp_path))])
-    model = make_model(learning_rate=3e-3)
-    trainer.fit(model, datamodule=tiny)
-    assert sorted(path.name for path in (tmp_path / "previews").iterdir()) == ["epoch_0002", "epoch_0003"]
-    for epoch in (2, 3):
-        sheet = tmp_path / "previews" / f"epoch_{epoch:04d}" / "A_e05.png"
-        for averaged in (True, False):
-            assert shown(sheet, model_of(tmp_path / f"{epoch}.ckpt", averaged=averaged), "A_e05", tiny) is averaged
-    final = model_of(tmp_path / "3.ckpt", averaged=True).state_dict()
-    assert all(torch.equal(tensor, final[name]) for name, tensor in model.state_dict().items())
 
 
 class Broken(SamplingPreview):
@@ -309,20 +286,6 @@ def test_preview_in_wandb_has_videos_and_a_growing_table(
     rows = [row for table in tables for row in table["data"]]
     assert [row[:2] for row in rows] == [[clip, epoch] for epoch in (1, 2) for clip in CLIPS]
     assert all(row[2]["_type"] == "video-file" and row[4] > 0 for row in rows)
-
-
-@pytest.mark.slow
-def test_preview_of_the_last_bundled_config_counts(tiny_root: Path, tmp_path: Path) -> None:
-    words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/preview.yaml"]
-    words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.dim=16", "--trainer.max_steps=1"]
-    words += ["--model.diffusion_steps=20", "--model.sampler.steps=2", "--trainer.log_every_n_steps=1"]
-    words += ["--model.motion_space.prior_frames=5"]  # clips of the miniature corpus are short
-    words += ["--trainer.limit_val_batches=0", "--trainer.enable_progress_bar=false"]
-    assert main(["fit", *words, f"--trainer.logger.save_dir={tmp_path}"]) == 0
-    sheets = list((tmp_path / "puppet/version_0/previews").glob("*/*.png"))
-    assert sorted(path.stem for path in sheets) == CLIPS  # the trainer's config alone draws one
-    with Image.open(sheets[0]) as image:
-        assert image.size[0] == 2 * 3 * 288 + 6
 
 
 def test_borrowed_model_is_restored(make_model: MakeModel) -> None:

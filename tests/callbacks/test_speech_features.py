@@ -12,7 +12,6 @@ import torch
 
 from facediff import registry
 from facediff.callbacks import SpeechFeatureCache
-from facediff.cli.app import main
 from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny
 
@@ -116,17 +115,3 @@ def test_speech_feature_cache_replaces_a_damaged_file(
         again, encoded = losses(SpeechFeatureCache(str(tmp_path)))
     assert again == first
     assert encoded == 1
-
-
-@pytest.mark.slow
-def test_speech_feature_cache_from_the_command_line(
-    tiny_root: Path, hubert_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
-    words = ["--config", "configs/experiment/puppet.yaml", "--config", "configs/callbacks/speech_features.yaml"]
-    words += ["--data=tests.fakes.tiny.Tiny", f"--data.root={tiny_root}", "--model.audio_encoder=hubert"]
-    words += ["--model.motion_space.prior_frames=5"]
-    words += [f"--model.audio_encoder.source={hubert_source}", "--model.dim=16", "--trainer.max_steps=1"]
-    words += ["--trainer.limit_val_batches=0", "--trainer.enable_progress_bar=false", "--trainer.log_every_n_steps=1"]
-    assert main(["fit", *words, f"--trainer.logger.save_dir={tmp_path}"]) == 0
-    assert len(list((tmp_path / "cache" / "speech_features").rglob("*.npy"))) == 10

@@ -8,6 +8,7 @@ gc.disable()  # what is imported and collected stays; it comes back below
 
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def tiny(tiny_root: Path) -> Tiny:
     return Tiny(root=str(tiny_root))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_model() -> Callable[..., DualPathDiffusion]:
     """A model small enough to train in a test; keyword arguments override."""
 
@@ -61,24 +62,27 @@ def make_model() -> Callable[..., DualPathDiffusion]:
     return make
 
 
+def quiet_trainer(folder: Path, **options: Any) -> pl.Trainer:  # noqa: ANN401
+    """A trainer for one epoch that writes nothing by itself; keyword arguments override."""
+    defaults: dict[str, Any] = {
+        "accelerator": "cpu",
+        "devices": 1,
+        "max_epochs": 1,
+        "logger": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "enable_checkpointing": False,
+        "num_sanity_val_steps": 0,
+        "default_root_dir": folder,
+        "log_every_n_steps": 1,
+    }
+    return pl.Trainer(**{**defaults, **options})
+
+
 @pytest.fixture
 def make_trainer(tmp_path: Path) -> Callable[..., pl.Trainer]:
-    def make(**options: object) -> pl.Trainer:
-        defaults: dict[str, object] = {
-            "accelerator": "cpu",
-            "devices": 1,
-            "max_epochs": 1,
-            "logger": False,
-            "enable_progress_bar": False,
-            "enable_model_summary": False,
-            "enable_checkpointing": False,
-            "num_sanity_val_steps": 0,
-            "default_root_dir": tmp_path,
-            "log_every_n_steps": 1,
-        }
-        return pl.Trainer(**{**defaults, **options})
-
-    return make
+    """:func:`quiet_trainer` in a folder of the test."""
+    return partial(quiet_trainer, tmp_path)
 
 
 def saved(network: Any, config: Any, folder: Path) -> Path:  # noqa: ANN401 - of transformers

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, collate
+from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny
 
 DIM = 16
@@ -42,6 +43,18 @@ def batch(tiny: Tiny) -> Batch:
     """Two clips, the first padded."""
     dataset = tiny.dataset("train")
     return collate([dataset[0], dataset[7]])
+
+
+@pytest.fixture
+def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Callable[..., DualPathDiffusion]:
+    """Models that know the miniature corpus; keyword arguments override."""
+
+    def build(**options: object) -> DualPathDiffusion:
+        model = make_model(**options)
+        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        return model.eval()
+
+    return build
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import torch
 
 from facediff.data.augmentation import Augmenter, filtered, read_augmentations
 from facediff.errors import FaceDiffError
-from facediff.models.adaptation import with_audio_encoder
 from facediff.models.audio_distillation import (
     LOW_LATENCY_DISTILLATION,
     DistillationOptions,
@@ -207,15 +205,3 @@ def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tin
         model, tiny, replace(LOW_LATENCY_DISTILLATION, steps=60, batch_size=6, workers=0, learning_rate=3e-3)
     )
     assert error() < 0.85 * before
-
-
-@pytest.mark.slow
-def test_a_student_of_another_size_learns_from_its_teacher(model: AnimationModel, tiny: Tiny) -> None:
-    small = {"class_path": "facediff.registry.audio_encoder.mel", "init_args": {"hidden_dim": 8, "num_layers": 2}}
-    model.adopt(tiny.assets())
-    torch.manual_seed(1)
-    student = with_audio_encoder(model, small)
-    options = replace(LOW_LATENCY_DISTILLATION, steps=40, batch_size=6, workers=0, learning_rate=3e-3)
-    first = distil_audio_encoder(copy.deepcopy(student), tiny, replace(options, steps=2), teacher=model.speech_encoder)
-    last = distil_audio_encoder(student, tiny, options, teacher=model.speech_encoder)
-    assert last < 0.5 * first

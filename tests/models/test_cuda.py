@@ -19,11 +19,9 @@ Make = Callable[..., DualPathDiffusion]
 
 
 @pytest.fixture
-def pair(make_model: Make, tiny: Tiny) -> tuple[DualPathDiffusion, DualPathDiffusion, Batch]:
+def pair(ready: Make, tiny: Tiny) -> tuple[DualPathDiffusion, DualPathDiffusion, Batch]:
     """A model on the processor, its twin on the GPU, and a batch."""
-    torch.manual_seed(0)
-    model = make_model().eval()
-    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+    model = ready()
     return model, deepcopy(model).to("cuda"), next(iter(tiny.train_dataloader()))
 
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from facediff import registry
 from facediff.models.decoders import GruDecoder, StyleTransformer, TokenAttention
 from facediff.models.layers import Attention
 
@@ -45,25 +44,6 @@ def test_the_last_norm_takes_each_frames_size_away_and_can_be_left_out() -> None
 
 def test_decoder_frame_sees_past_and_future(decoder: nn.Module) -> None:
     assert reach(lambda x: decoder(x, STYLE, MASK)).all()
-
-
-@pytest.mark.parametrize("part", [(kind, n) for kind in ("fusion", "decoder") for n in registry.KINDS[kind].names()])
-@pytest.mark.parametrize("clips", [(0, 1, 2, 3), (3,)], ids=["padded", "whole"])
-def test_prepare_changes_nothing(
-    part: tuple[str, str],
-    clips: tuple[int, ...],
-    make: Callable[..., nn.Module],
-    call: Callable[..., tuple[Tensor, ...]],
-) -> None:
-    """Every registered fusion and decoder, over several steps with one preparation."""
-    module = make(*part).eval()
-    first, second, mask = call(part[0], clips)
-    constant, moving = (first, second) if part[0] == "fusion" else (second, first)
-    prepared = module.prepare(constant, mask)
-    for scale in (1.0, 3.0) if prepared is not None else ():
-        inputs = (first, scale * moving) if part[0] == "fusion" else (scale * moving, second)
-        out, expected = module(*inputs, mask, prepared), module(*inputs, mask)
-        torch.testing.assert_close(out[mask], expected[mask], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("tokens", [1, 2, 3, 4, 9])

@@ -20,10 +20,8 @@ Make = Callable[..., DualPathDiffusion]
 
 
 @pytest.fixture
-def model(make_model: Make, tiny: Tiny) -> DualPathDiffusion:
-    made = make_model()
-    made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    return made.eval()
+def model(ready: Make) -> DualPathDiffusion:
+    return ready()
 
 
 def test_the_loss_is_the_weighted_sum_of_eq_15(model: DualPathDiffusion, tiny: Tiny) -> None:

@@ -23,7 +23,7 @@ COMPONENTS = 6
 
 
 @pytest.fixture
-def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
+def ready(ready: Ready, tiny: Tiny) -> Ready:
     """A model whose predictions depend on the noise."""
 
     def make(space: str = "folded", **options: object) -> DualPathDiffusion:
@@ -31,8 +31,7 @@ def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
             options["motion_space"] = partial(registry.motion_space.components, count=COMPONENTS)
         else:
             options["sampling_space"] = space
-        model = make_model(**options)
-        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        model = ready(**options)
         torch.manual_seed(1)
         if space == "components":
             mean, shapes = tiny.principal_motion(COMPONENTS, torch.ones(3 * VERTICES))
@@ -41,7 +40,7 @@ def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
         nn.init.normal_(model.network.embed.bias)
         nn.init.normal_(model.network.unembed.weight, std=0.1)
         model.windows = PLAN
-        return model.eval()
+        return model
 
     return make
 

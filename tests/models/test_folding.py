@@ -106,15 +106,14 @@ SAMPLERS += [("ddim", {"steps": 7, "eta": 0.5}), ("ddim", {"steps": 1}), ("dpm_s
 
 
 @pytest.fixture
-def ready(make_model: Make, tiny: Tiny) -> Make:
-    """Models that know the miniature corpus, with biases that matter."""
+def ready(ready: Make) -> Make:
+    """Models with biases that matter."""
 
     def make(**options: object) -> DualPathDiffusion:
-        model = make_model(**options)
-        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        model = ready(**options)
         nn.init.normal_(model.network.embed.bias)
         nn.init.normal_(model.network.unembed.bias)
-        return model.eval()
+        return model
 
     return make
 

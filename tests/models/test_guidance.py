@@ -25,15 +25,14 @@ EVERYTHING = ("speech", "identity", "style")
 
 
 @pytest.fixture
-def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
+def ready(ready: Ready) -> Ready:
     def make(**options: object) -> DualPathDiffusion:
-        model = make_model(**{**DROPOUT, "sampler": partial(registry.sampler.ddim, steps=2), **options})
-        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        model = ready(**{**DROPOUT, "sampler": partial(registry.sampler.ddim, steps=2), **options})
         for learnt in (model.network.no_speech, model.network.no_style):
             if learnt is not None:
                 nn.init.normal_(learnt)
         model.windows = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)
-        return model.eval()
+        return model
 
     return make
 

@@ -9,32 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from facediff.models.layers import (
-    RotaryEmbedding,
     interpolate_frames,
     recurrent_nodes,
 )
 from tests.fakes.onnx_nodes import recurrent_node
 
 Array = NDArray[np.float64]
-
-
-def rotated(x: Array, base: float = 10_000.0) -> Array:
-    """RoFormer's rotation as multiplication of complex pairs, frame by frame."""
-    half = x.shape[-1] // 2
-    frequency = base ** (-np.arange(half) / half)
-    turned = (x[..., :half] + 1j * x[..., half:]) * np.exp(1j * np.arange(len(x))[:, None] * frequency)
-    return np.concatenate([turned.real, turned.imag], axis=-1)
-
-
-def test_rotary_scores_depend_on_distance_only() -> None:
-    torch.manual_seed(0)
-    rotary, frames = RotaryEmbedding(8), 50
-    query, key = (torch.randn(8).expand(1, 1, frames, 8) for _ in range(2))
-    scores = (rotary(query) @ rotary(key).transpose(-1, -2))[0, 0]
-    torch.testing.assert_close(scores[1:, 1:], scores[:-1, :-1], rtol=0, atol=1e-4)
-    assert scores[0].std() > 0.1  # and they do depend on it
-    torch.testing.assert_close(rotary(query).norm(dim=-1), query.norm(dim=-1))
-    np.testing.assert_allclose(rotary(query)[0, 0].numpy(), rotated(query[0, 0].numpy()), atol=1e-5)
 
 
 def interpolated(values: Tensor, frames: int) -> Array:

@@ -14,7 +14,7 @@ from torch import Tensor
 from facediff import registry
 from facediff.data import collate
 from facediff.errors import FaceDiffError
-from facediff.models import AnimationModel, DualPathDiffusion, StyleContentDisentanglement
+from facediff.models import AnimationModel, StyleContentDisentanglement
 from facediff.models.inference import SpeechStream, WindowOverlap
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import SpeechLevel, WindowPlan
@@ -25,12 +25,11 @@ Ready = Callable[..., AnimationModel]
 
 
 @pytest.fixture
-def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
+def ready(ready: Ready, tiny: Tiny) -> Ready:
     def make(name: str = "dual_path", **options: object) -> AnimationModel:
         torch.manual_seed(0)
-        model: AnimationModel
         if name == "dual_path":
-            model = make_model(**options)
+            model = ready(**options)
             torch.nn.init.normal_(model.network.embed.bias)
         else:
             model = StyleContentDisentanglement(
@@ -43,7 +42,7 @@ def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
                 mesh_encoder=registry.mesh_encoder.linear,
                 basis_size=4,
             )
-        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+            model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
         if "motion_space" in options:
             model.measure(tiny)
         model.windows = PLAN

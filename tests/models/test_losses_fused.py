@@ -18,10 +18,8 @@ Make = Callable[..., DualPathDiffusion]
 
 
 @pytest.fixture
-def model(make_model: Make, tiny: Tiny) -> DualPathDiffusion:
-    made = make_model()
-    made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    return made.eval()
+def model(ready: Make) -> DualPathDiffusion:
+    return ready()
 
 
 def test_losses_are_those_of_added_and_removed_noise(model: DualPathDiffusion, tiny: Tiny) -> None:
@@ -77,26 +75,3 @@ def test_a_training_step_noises_each_clip_as_often_as_asked(model: DualPathDiffu
     model.losses(collate([dataset[i] for i in range(6)]))
     assert len(seen) == 18
     assert len(set(seen)) > 6  # each draw has a step of its own
-
-
-@pytest.mark.slow
-def test_mixed_precision_learns_as_full_precision_does(
-    make_model: Make, tiny: Tiny, make_trainer: Callable[..., pl.Trainer]
-) -> None:
-    ends = {}
-    for precision in ("32-true", "bf16-mixed"):
-        model = make_model(learning_rate=3e-3, diffusion_steps=10)
-        data = Tiny(root=str(tiny.root), max_frames_per_batch=200)
-        make_trainer(precision=precision, max_epochs=1, limit_val_batches=0).fit(model, datamodule=data)
-        batch = collate([data.dataset("train")[i] for i in range(8)])
-
-        def measured(model: DualPathDiffusion = model, batch: object = batch) -> float:
-            with torch.no_grad():
-                return float(model.eval().losses(batch, torch.Generator().manual_seed(0))["loss"])
-
-        first = measured()
-        trainer = make_trainer(precision=precision, max_epochs=25, limit_val_batches=0, gradient_clip_val=1.0)
-        trainer.fit(model.train(), datamodule=data)
-        ends[precision] = measured()
-        assert ends[precision] < 0.5 * first
-    assert ends["bf16-mixed"] == pytest.approx(ends["32-true"], rel=0.2)

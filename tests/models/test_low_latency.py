@@ -79,18 +79,13 @@ def test_windows_with_a_past_share_its_noise(plan: WindowPlan) -> None:
 
 
 @pytest.fixture(params=["frames by themselves", "prior over time"])
-def model(
-    make_model: Callable[..., DualPathDiffusion], tiny: Tiny, request: pytest.FixtureRequest
-) -> DualPathDiffusion:
+def model(ready: Callable[..., DualPathDiffusion], tiny: Tiny, request: pytest.FixtureRequest) -> DualPathDiffusion:
     if request.param == "frames by themselves":
-        made = make_model()
-        made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-        return made.eval()
-    made = make_model(motion_space=partial(registry.motion_space.components, count=6, prior_frames=7))
-    made.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
+        return ready()
+    made = ready(motion_space=partial(registry.motion_space.components, count=6, prior_frames=7))
     made.measure(tiny)
     torch.nn.init.normal_(made.network.unembed.weight)
-    return made.eval()
+    return made
 
 
 @pytest.mark.slow

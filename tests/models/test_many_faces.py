@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pickle
 from collections import Counter
-from collections.abc import Callable
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,11 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch import Callback, Trainer
 
 from facediff import registry
 from facediff.callbacks import EmaWithWarmup
-from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
+from facediff.callbacks.checkpoints import AtomicCheckpointIO
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, ManyFaces, load_model
@@ -25,9 +22,8 @@ from facediff.models.checkpoint import corpus_of, read_checkpoint
 from facediff.models.dual_path.network import TRUNK
 from facediff.models.styles import style_from, vector_of
 from tests.fakes.channels import TinyChannels, write_channels
+from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import VERTICES, Tiny, tiny_model_options, write_tiny
-
-MakeTrainer = Callable[..., Trainer]
 
 
 class Halved(Tiny):
@@ -89,16 +85,7 @@ def many_faces(data: Tiny) -> ManyFaces:
 def trained(roots: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("trained") / "many.ckpt"
     data = corpora(roots)
-    trainer = Trainer(
-        accelerator="cpu",
-        max_epochs=2,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=[EmaWithWarmup()],
-        plugins=[AtomicCheckpointIO()],
-    )
+    trainer = quiet_trainer(path.parent, max_epochs=2, callbacks=[EmaWithWarmup()], plugins=[AtomicCheckpointIO()])
     trainer.fit(many_faces(data), data)
     assert {"val/energy", "val/halved/energy", "val/weights/energy"} <= trainer.callback_metrics.keys()
     trainer.save_checkpoint(path)
@@ -191,50 +178,9 @@ def test_folders_of_publish_keep_all_faces(trained: Path, tmp_path: Path) -> Non
     assert "corpora/mine" not in config
 
 
-@pytest.mark.slow
-def test_a_resumed_training_equals_a_whole_one(
-    roots: dict[str, Path], make_trainer: MakeTrainer, tmp_path: Path
-) -> None:
-    def train(folder: Path, *, stop: int | None = None, resume: str | None = None) -> dict[str, Any]:
-        class Stop(Callback):
-            def on_train_batch_end(self, trainer: Trainer, *values: object) -> None:
-                if trainer.global_step == stop:
-                    raise KeyError(stop)
-
-        torch.manual_seed(3)
-        data = corpora(roots)
-        trainer = make_trainer(
-            limit_val_batches=0,
-            default_root_dir=folder,
-            callbacks=[EmaWithWarmup(), LastCheckpoint(every_n_steps=1), Stop()],
-            plugins=[AtomicCheckpointIO()],
-        )
-        with pytest.raises(KeyError) if stop else nullcontext():
-            trainer.fit(many_faces(data), data, ckpt_path=resume)
-        path = next(folder.rglob("last.ckpt"))
-        content: dict[str, Any] = torch.load(path, weights_only=True)
-        return {**content["state_dict"], **{f"own {k}": v for k, v in content["current_model_state"].items()}}
-
-    whole = train(tmp_path / "whole")
-    train(tmp_path / "stopped", stop=7)
-    resumed = train(tmp_path / "stopped", resume=str(next((tmp_path / "stopped").rglob("last.ckpt"))))
-    assert whole.keys() == resumed.keys()
-    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
-
-
 def test_a_new_face_costs_a_head(roots: dict[str, Path], trained: Path, tmp_path: Path) -> None:
-    words = ["--checkpoint", str(trained), "--face", "tests.models.test_many_faces.Halved", "--yes", "--quiet"]
-    words += [
-        "--data-root",
-        str(roots["halved"]),
-        "--accelerator",
-        "cpu",
-        "--epochs",
-        "2",
-        "-o",
-        str(tmp_path / "new.ckpt"),
-    ]
-    assert main(["adapt", *words]) == 0
+    words = f"--checkpoint {trained} --face {__name__}.Halved --data-root {roots['halved']} -o {tmp_path}/new.ckpt"
+    assert main(["adapt", *words.split(), "--accelerator", "cpu", "--epochs", "2", "--yes", "--quiet"]) == 0
     before, after = load_model(trained), load_model(tmp_path / "new.ckpt")
     assert isinstance(before, ManyFaces)
     assert isinstance(after, DualPathDiffusion)

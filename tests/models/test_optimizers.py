@@ -16,6 +16,7 @@ from facediff.callbacks.checkpoints import AtomicCheckpointIO
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.optimizers import FactorSchedule, configure, parameter_groups, schedule_changed
+from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
@@ -23,12 +24,9 @@ SGD = {"class_path": "torch.optim.SGD", "init_args": {"lr": 0.01, "momentum": 0.
 
 
 def fit(model: DualPathDiffusion, root: Path, folder: Path, **options: Any) -> pl.Trainer:  # noqa: ANN401
-    trainer = pl.Trainer(
-        accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False, limit_val_batches=0,
-        default_root_dir=folder, enable_checkpointing=False, plugins=[AtomicCheckpointIO()],
-        callbacks=options.pop("callbacks", None), max_epochs=options.pop("max_epochs", 1),
-    )  # fmt: skip
-    trainer.fit(model, datamodule=Tiny(root=str(root), batch_size=4), weights_only=True, **options)
+    path = options.pop("ckpt_path", None)
+    trainer = quiet_trainer(folder, limit_val_batches=0, plugins=[AtomicCheckpointIO()], **options)
+    trainer.fit(model, datamodule=Tiny(root=str(root), batch_size=4), weights_only=True, ckpt_path=path)
     return trainer
 
 

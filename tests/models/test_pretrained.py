@@ -18,10 +18,11 @@ import yaml
 from facediff.callbacks.averaging import EmaWithWarmup
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
-from facediff.models.checkpoint import checked_file, read_assets, read_checkpoint
+from facediff.models.checkpoint import read_assets, read_checkpoint
 from facediff.models.pretrained import coded, decoded, stored_once
 from facediff.utils.licences import Licence, commercial_use
 from facediff.utils.torch_files import read_safetensors
+from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import Tiny, write_tiny
 
 
@@ -44,10 +45,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
         def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
             trainer.save_checkpoint(folder / "model.ckpt")
 
-    trainer = pl.Trainer(
-        accelerator="cpu", max_steps=3, logger=False, enable_progress_bar=False, enable_model_summary=False,
-        enable_checkpointing=False, default_root_dir=folder, limit_val_batches=0, callbacks=[EmaWithWarmup(), Saves()],
-    )  # fmt: skip
+    trainer = quiet_trainer(folder, max_steps=3, limit_val_batches=0, callbacks=[EmaWithWarmup(), Saves()])
     trainer.fit(model, Tiny(root=str(write_tiny(folder / "tiny"))))
     return folder / "model.ckpt"
 
@@ -145,14 +143,6 @@ def test_a_published_model_is_published_again_alike(published: Path, tmp_path: P
     again = load_model(published).save_pretrained(tmp_path / "again")
     assert (again / "model.safetensors").read_bytes() == (published / "model.safetensors").read_bytes()
     assert (again / "assets.npz").read_bytes() == (published / "assets.npz").read_bytes()
-
-
-@pytest.mark.slow
-def test_lightning_loads_a_folder_too(checkpoint: Path, published: Path) -> None:
-    one, two = (DualPathDiffusion.load_from_checkpoint(path).state_dict() for path in (checkpoint, published))
-    assert all(torch.equal(one[name], two[name]) for name in one)
-    with checked_file(published) as stream:
-        assert stream.tell() == 0
 
 
 # Licences.

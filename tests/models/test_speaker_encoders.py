@@ -31,22 +31,6 @@ def test_statistics_against_numpy() -> None:
         )
 
 
-@pytest.mark.parametrize("frames", [1, 5, 64, 300])
-def test_positions_serve_any_length(frames: int) -> None:
-    """With a silent GRU and no layers only the positions are left."""
-    encoder = TcnGruTransformer(dim=DIM, num_heads=1, num_layers=0, n_positions=64).eval()
-    for parameter in encoder.gru.parameters():
-        nn.init.zeros_(parameter)
-    encoder.norm = nn.Identity()
-    nn.init.normal_(encoder.positions)
-    mask = torch.arange(frames + 3)[None] < frames
-    features = encoder.features(torch.randn(1, frames + 3, DIM), mask)[0, :frames].detach().numpy()
-    centres, wanted = (np.arange(64) + 0.5) / 64, (np.arange(frames) + 0.5) / frames
-    table = encoder.positions.detach().numpy()
-    expected = np.stack([np.interp(wanted, centres, table[:, c]) for c in range(DIM)], axis=-1)
-    np.testing.assert_allclose(features, expected, atol=1e-4)
-
-
 @pytest.mark.parametrize("causal", [True, False])
 def test_centred_convolutions_do_not_reach_into_the_padding(causal: bool) -> None:
     torch.manual_seed(0)

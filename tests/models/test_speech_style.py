@@ -126,12 +126,10 @@ def test_the_usual_style_of_a_further_identity_is_of_its_own_clips(
 
 
 @pytest.fixture
-def model(make_model: Callable[..., DualPathDiffusion], tiny: Tiny, batch: Batch) -> DualPathDiffusion:
+def model(ready: Callable[..., DualPathDiffusion], batch: Batch) -> DualPathDiffusion:
     """A model that has trained, without an optimiser, on a few batches."""
     options = {"style_from_speech": True, "identity_dropout": 0.0, "sampler": partial(registry.sampler.ddim, steps=2)}
-    model = make_model(**options)
-    model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-    model.train()
+    model = ready(**options).train()
     for _ in range(3):
         model.losses(batch)
     return model.eval()

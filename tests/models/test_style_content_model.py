@@ -24,6 +24,7 @@ from facediff.models.style_content.losses import (
     pair_up,
 )
 from facediff.models.style_content.network import StyleContentDecoder
+from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.style_content import make
 from tests.fakes.tiny import VERTICES, Tiny
 
@@ -209,16 +210,7 @@ def trained(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint after a few steps with weight averaging."""
     folder = tmp_path_factory.mktemp("style_content")
     averaging = EMAWeightAveraging(decay=0.9, use_buffers=False)
-    trainer = Trainer(
-        accelerator="cpu",
-        max_epochs=4,
-        logger=False,
-        callbacks=[averaging],
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        default_root_dir=folder,
-    )
+    trainer = quiet_trainer(folder, max_epochs=4, callbacks=[averaging])
     trainer.fit(make(learning_rate=1e-3), datamodule=Tiny(root=str(tiny_root), batch_size=4))
     trainer.save_checkpoint(folder / "trained.ckpt")
     return folder / "trained.ckpt"
@@ -262,21 +254,3 @@ class TestTrained:
         # Mean and spread over the clip are taken out.
         torch.testing.assert_close(content.mean(1), torch.zeros(1, 8), atol=1e-5, rtol=0)
         assert float((content.std(1, correction=0) - 1).abs().max()) < 0.05
-
-
-def test_the_basis_starts_from_principal_components(tiny: Tiny) -> None:
-    """The components span the motion of the training clips as NumPy's own decomposition does."""
-    mean, shapes = tiny.principal_motion(4)
-    frames = []
-    for number, clip in enumerate(tiny.clips("train"), start=1):
-        count = tiny.corpus.frames(clip)
-        parts, phase = min(count, 16), number * (np.sqrt(5) - 1) / 2 % 1
-        for index in ((np.arange(parts) + phase) * count / parts).astype(int):
-            frames.append(tiny.corpus.read_motion(clip, index, index + 1).flatten().double().numpy())
-    stack = np.stack(frames)
-    np.testing.assert_allclose(mean, stack.mean(0), atol=1e-7)
-    _, values, axes = np.linalg.svd(stack - stack.mean(0), full_matrices=False)
-    spreads = values / np.sqrt(len(stack))
-    for shape, spread, axis in zip(shapes.double().numpy(), spreads, axes, strict=False):
-        assert np.linalg.norm(shape) == pytest.approx(spread, rel=1e-4)
-        assert abs(shape @ axis) == pytest.approx(spread, rel=1e-4)

@@ -47,28 +47,6 @@ def double(tensor: torch.Tensor) -> Array:
     return tensor.detach().double().numpy()
 
 
-def sigmoid(x: Array) -> Array:
-    return 1 / (1 + np.exp(-x))
-
-
-def test_style_is_the_last_state_of_an_lstm(tiny: Tiny) -> None:
-    """Chai et al.: intermediate features of each frame, then an LSTM; the state after the last frame is the style."""
-    model = ready(tiny)
-    network = model.network
-    motion, lengths = torch.randn(2, 9, VERTICES, 3), (9, 6)
-    mask = torch.arange(9)[None] < torch.tensor(lengths)[:, None]
-    w = {name: double(value) for name, value in network.style_encoder.lstm.state_dict().items()}
-    frames = double(network.style_frames(motion))
-    for row, length in enumerate(lengths):
-        hidden, cell = np.zeros(4), np.zeros(4)
-        for x in frames[row, :length]:
-            gates = w["weight_ih_l0"] @ x + w["bias_ih_l0"] + w["weight_hh_l0"] @ hidden + w["bias_hh_l0"]
-            put, forget, candidate, out = np.split(gates, 4)
-            cell = sigmoid(forget) * cell + sigmoid(put) * np.tanh(candidate)
-            hidden = sigmoid(out) * np.tanh(cell)
-        np.testing.assert_allclose(double(network.style(motion, mask))[row], hidden, **CLOSE)
-
-
 @pytest.mark.parametrize("scale", ["clip", "free"])
 def test_content_is_a_map_of_each_frame_and_may_lose_mean_and_spread(tiny: Tiny, scale: str) -> None:
     model = ready(tiny, content_scale=scale)

@@ -21,16 +21,6 @@ Ready = Callable[..., DualPathDiffusion]
 
 
 @pytest.fixture
-def ready(make_model: Callable[..., DualPathDiffusion], tiny: Tiny) -> Ready:
-    def make(**options: object) -> DualPathDiffusion:
-        model = make_model(**options)
-        model.adopt(tiny.assets().with_motion_scale(tiny.motion_scale()))
-        return model.eval()
-
-    return make
-
-
-@pytest.fixture
 def batch(tiny: Tiny) -> Batch:
     """Two clips of A and two of B."""
     dataset = tiny.dataset("train")
