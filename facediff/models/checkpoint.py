@@ -161,9 +161,13 @@ WRAPPER = re.compile(r"(?:^|(?<=\.))(?:_orig_mod|_forward_module|_fsdp_wrapped_m
 
 def check_content(checkpoint: Any, path: object) -> None:  # noqa: ANN401 - whatever a file holds
     """Refuse a content that has not the outer form of a checkpoint of facediff's, and drop options of 1.x in place."""
-    parts = {"hyper_parameters", "state_dict", ASSETS_KEY}
-    complete = isinstance(checkpoint, dict) and all(isinstance(checkpoint.get(part), dict) for part in parts)
-    if not complete or checkpoint.get(FORMAT_KEY) != FORMAT:
+    parts, optional = ("hyper_parameters", "state_dict", ASSETS_KEY), (DATA_SOURCE_KEY, "datamodule_hyper_parameters")
+    complete = (
+        isinstance(checkpoint, dict)
+        and all(isinstance(checkpoint.get(part), dict) for part in parts)
+        and all(isinstance(checkpoint.get(part), dict | None) for part in optional)
+    )
+    if not complete or not isinstance(checkpoint.get(FORMAT_KEY), int) or checkpoint[FORMAT_KEY] != FORMAT:
         raise FaceDiffError(
             f"{path}: written by another version of facediff, whose checkpoints this one cannot read; train the model "
             f"again with `facediff fit`, or use the version that wrote it"
