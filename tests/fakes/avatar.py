@@ -6,8 +6,7 @@ puts them where they are seen; teeth and head have the same targets, and some ta
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -15,76 +14,11 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 
-from tests.fakes.glb_targets import pack
+from tests.fakes.glb_targets import File
 from tests.fakes.heads import cleaned, eyeballs, teeth
 from tests.fakes.small_face import M2, Shape, build_face, small_shapes
-
-TYPES = {"float32": 5126, "int16": 5122, "uint16": 5123, "uint8": 5121}
-
-
-@dataclass
-class File:
-    """A .glb in the making."""
-
-    content: dict[str, Any] = field(
-        default_factory=lambda: {
-            "asset": {"version": "2.0", "generator": "elsewhere"},
-            "bufferViews": [],
-            "accessors": [],
-        }
-    )
-    binary: bytes = b""
-
-    def view(self, data: bytes, **more: object) -> int:
-        """Append bytes, four to a word."""
-        self.binary += bytes(-len(self.binary) % 4)
-        self.content["bufferViews"].append(
-            {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data), **more}
-        )
-        self.binary += data
-        return len(self.content["bufferViews"]) - 1
-
-    def add(self, array: np.ndarray, form: str, *, bounds: bool = False, sparse: bool = False, **more: object) -> int:
-        """Append an array as an accessor."""
-        array = np.ascontiguousarray(array)
-        accessor: dict[str, Any] = {"componentType": TYPES[array.dtype.name], "count": len(array), "type": form}
-        if sparse:
-            moved = np.flatnonzero(np.abs(array).any(axis=1))
-            moved = moved if len(moved) else np.array([0])
-            accessor["sparse"] = {
-                "count": len(moved),
-                "indices": {"bufferView": self.view(moved.astype("<u2").tobytes()), "componentType": 5123},
-                "values": {"bufferView": self.view(array[moved].tobytes())},
-            }
-        elif array.dtype == np.int16:  # rows begin at multiples of four bytes
-            padded = np.pad(array, ((0, 0), (0, 1)))
-            accessor |= {"bufferView": self.view(padded.tobytes(), byteStride=8, **more), "normalized": True}
-        else:
-            accessor["bufferView"] = self.view(array.tobytes(), **more)
-        if bounds:
-            columns = array.reshape(len(array), -1)
-            accessor |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
-        self.content["accessors"].append(accessor)
-        return len(self.content["accessors"]) - 1
-
-    def write(self, path: Path) -> Path:
-        """Write the file."""
-        self.content["buffers"] = [{"byteLength": len(self.binary) + -len(self.binary) % 4}]
-        path.write_bytes(pack(self.content, self.binary))
-        return path
-
-
-def png(pixels: np.ndarray) -> bytes:
-    """A picture (H, W, 3) of bytes as PNG."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    height, width, _ = pixels.shape
-    rows = b"".join(b"\0" + row.tobytes() for row in pixels.astype(np.uint8))
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 def normals_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -211,7 +145,8 @@ def write_avatar(
     binds = np.stack([np.linalg.inv(each) @ placed for each in (placed, joint)])
     content["nodes"], content["meshes"], content["scene"] = nodes, [], 0
     checks = np.kron(np.indices((8, 8)).sum(0) % 2, np.ones((4, 4)))[..., None] * [60, 40, 40] + [180, 150, 140]
-    content["images"] = [{"name": "skin", "mimeType": "image/png", "bufferView": file.view(png(checks))}]
+    Image.fromarray(checks.astype(np.uint8)).save(png := io.BytesIO(), "PNG")
+    content["images"] = [{"name": "skin", "mimeType": "image/png", "bufferView": file.view(png.getvalue())}]
     content["samplers"] = [{"magFilter": 9729, "minFilter": 9987}]
     content["textures"] = [{"source": 0, "sampler": 0}]
     content["materials"] = [

@@ -15,6 +15,7 @@ from facediff.errors import FaceDiffError
 from facediff.export.format import pictures_of
 from facediff.mesh import read_mesh
 from facediff.mesh.textures import read_textures
+from tests.fakes.glb_targets import pack
 
 XYZ = ["property float x", "property float y", "property float z"]
 LIST = "property list uchar int vertex_indices"
@@ -57,13 +58,6 @@ GOOD: dict[str, Any] = {
 DATA = CORNERS.tobytes() + bytes([0, 1, 2, 0, 2, 3, 0, 0])
 
 
-def glb(content: object, binary: bytes = DATA) -> bytes:
-    text = content if isinstance(content, bytes) else json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
 def changed(path: str, value: object) -> bytes:
     """The good file with one entry replaced, such as ``accessors.0.count``."""
     content = json.loads(json.dumps(GOOD))
@@ -72,7 +66,7 @@ def changed(path: str, value: object) -> bytes:
     for key in outer:
         holder = holder[int(key) if key.isdigit() else key]
     holder[int(last) if last.isdigit() else last] = value
-    return glb(content)
+    return pack(content, DATA)
 
 
 REFUSED: dict[str, tuple[str, bytes]] = {
@@ -112,8 +106,8 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     "glb turned by a huge rotation": (".glb", changed("nodes.0", {"mesh": 0, "rotation": [1e300, 0, 0, 1]})),
     "glb moved beyond all numbers": (".glb", changed("nodes.0", {"mesh": 0, "translation": [1e300, 0, 0]})),
     "glb of a huge scale": (".glb", changed("nodes.0", {"mesh": 0, "scale": [1e300, 1, 1]})),
-    "glb with vertex 9": (".glb", glb(GOOD, DATA.replace(bytes([0, 2, 3, 0, 0]), bytes([0, 2, 9, 0, 0])))),
-    "glb whose chunk is longer": (".glb", glb(GOOD)[:-8]),
+    "glb with vertex 9": (".glb", pack(GOOD, DATA.replace(bytes([0, 2, 3, 0, 0]), bytes([0, 2, 9, 0, 0])))),
+    "glb whose chunk is longer": (".glb", pack(GOOD, DATA)[:-8]),
     # Others
     "a format that is not read": (".gltf", json.dumps(GOOD).encode()),
 }
@@ -214,7 +208,7 @@ def test_sparse_changes_of_a_glb_are_made(tmp_path: Path) -> None:
         "values": {"bufferView": 3},
     }
     moved = np.array([[7, 8, 9]], "<f4")
-    (tmp_path / "a.glb").write_bytes(glb(content, DATA + bytes([2, 0, 0, 0]) + moved.tobytes()))
+    (tmp_path / "a.glb").write_bytes(pack(content, DATA + bytes([2, 0, 0, 0]) + moved.tobytes()))
     assert read_mesh(tmp_path / "a.glb").vertices.tolist() == [[0, 0, 0], [1, 0, 0], [7, 8, 9], [0, 1, 0]]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from facediff.editing.shapes import ShapeSet, read_shapes
 from facediff.errors import FaceDiffError
-from tests.fakes.glb_targets import glb_with_targets, pack
+from tests.fakes.glb_targets import glb_with_targets
 
 RNG = np.random.default_rng(0)
 GRID = np.array([[x, y, 0.3 * np.sin(2 * x) * np.cos(y)] for y in range(6) for x in range(6)]) * 0.03
@@ -111,7 +111,7 @@ def test_shapes_that_differ_among_themselves_are_refused(folder: Path) -> None:
 @pytest.mark.parametrize("sparse", [False, True])
 def test_targets_of_a_glb(tmp_path: Path, sparse: bool) -> None:
     deltas = {name: np.where(RNG.uniform(size=(36, 1)) < 0.5, delta, 0.0) for name, delta in DELTAS.items()}
-    (tmp_path / "a.glb").write_bytes(pack(*glb_with_targets(GRID, FACES, deltas, sparse=sparse)))
+    glb_with_targets(GRID, FACES, deltas, sparse=sparse).write(tmp_path / "a.glb")
     check(read_shapes(tmp_path / "a.glb", GRID), deltas)
     # glTF is in metres: a template in centimetres takes shapes a hundred times as large.
     made = read_shapes(tmp_path / "a.glb", 100 * GRID, "cm")
@@ -119,8 +119,8 @@ def test_targets_of_a_glb(tmp_path: Path, sparse: bool) -> None:
 
 
 def test_parts_of_one_mesh_are_put_together(tmp_path: Path) -> None:
-    gltf, binary = glb_with_targets(GRID, FACES, DELTAS)
-    gltf["meshes"][0]["primitives"] *= 2
-    (tmp_path / "a.glb").write_bytes(pack(gltf, binary))
+    file = glb_with_targets(GRID, FACES, DELTAS)
+    file.content["meshes"][0]["primitives"] *= 2
+    file.write(tmp_path / "a.glb")
     made = read_shapes(tmp_path / "a.glb", np.concatenate([GRID, GRID]))
     assert made.deltas[:, :36] == pytest.approx(made.deltas[:, 36:])

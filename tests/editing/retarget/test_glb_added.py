@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,25 +12,14 @@ from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb
 from facediff.mesh.glb_scene import placed_parts
-from tests.fakes.glb_targets import pack
+from tests.fakes.glb_targets import File, pack
 from tests.fakes.meshes import relief
 
 
 def avatar(path: Path) -> None:
     """A textured, skinned face with two targets that are animated, below a scaled, turned node; and a second mesh."""
-    points, faces = relief(9, 8)
-    chunks: list[bytes] = []
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-
-    def add(array: np.ndarray, form: str) -> int:
-        data = np.ascontiguousarray(array).tobytes()
-        views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(data)})
-        chunks.append(data + bytes(-len(data) % 4))
-        kind = {"float32": 5126, "uint16": 5123}[array.dtype.name]
-        accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(array), "type": form})
-        return len(accessors) - 1
-
+    (points, faces), file = relief(9, 8), File()
+    add = file.add
     count = len(points)
     weights = np.zeros((count, 4), np.float32)
     weights[:, 0] = 1
@@ -51,8 +37,7 @@ def avatar(path: Path) -> None:
     hat = {"attributes": {"POSITION": add((points + [0, 9, 0]).astype(np.float32), "VEC3")}, "indices": face["indices"]}
     times = add(np.float32([0, 1]), "SCALAR")
     smile = {"input": times, "output": add(np.float32([0, 0, 1, 0.5]), "SCALAR"), "interpolation": "LINEAR"}
-    content = {
-        "asset": {"version": "2.0", "generator": "elsewhere"},
+    file.content |= {
         "scene": 0,
         "scenes": [{"nodes": [0, 2]}],
         "nodes": [
@@ -76,21 +61,9 @@ def avatar(path: Path) -> None:
                 "channels": [{"sampler": 0, "target": {"node": 1, "path": "weights"}}],
             }
         ],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": sum(map(len, chunks))}],
         "extensionsUsed": ["KHR_materials_unlit"],
     }
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    binary = b"".join(chunks)
-    path.write_bytes(
-        struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
-        + struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(binary), b"BIN\0")
-        + binary
-    )
+    file.write(path)
 
 
 def opened(path: Path) -> Glb:

@@ -14,7 +14,7 @@ from facediff.editing.controls.procedural import move_head
 from facediff.editing.retargeting import retarget
 from facediff.mesh.glb import open_glb
 from facediff.render import Look
-from tests.fakes.avatar import File
+from tests.fakes.glb_targets import File
 
 TARGET = ("--target-mesh", "face.obj")
 
