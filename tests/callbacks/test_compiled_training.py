@@ -5,16 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
-import lightning.pytorch as pl
 import pytest
 
-from facediff.models import DualPathDiffusion
-
-MakeModel = Callable[..., DualPathDiffusion]
-MakeTrainer = Callable[..., pl.Trainer]
 ROOT = Path(__file__).parents[2]
 
 

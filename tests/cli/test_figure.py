@@ -18,7 +18,6 @@ from facediff.evaluation.figures import FigureData
 from tests.fakes.tiny import VERTICES
 from tests.fakes.words import last_of_each
 
-ROOT = Path(__file__).parents[2]
 TINY = ["--topology", "tests.fakes.tiny.Tiny"]
 SMALL = ["--width", "85", "--dpi", "80"]
 FIGURES = ("frames", "heatmap", "error", "lips", "training")

@@ -25,7 +25,6 @@ from facediff.errors import FaceDiffError
 from facediff.utils.option import Option
 from facediff.utils.ranges import Range
 
-ROOT = Path(__file__).parents[2]
 OWN_PARSERS = ("run", "lightning")
 FUNCTIONS = sorted(name for name in COMMANDS if COMMANDS[name].target.partition(":")[2] not in OWN_PARSERS)
 

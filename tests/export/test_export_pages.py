@@ -15,13 +15,6 @@ from facediff.export import FORMATS, write_animations
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "docs" / "export.md", ROOT / "docs" / "programs.md"]
-COMMANDS = {
-    line
-    for page in PAGES
-    for line in re.findall(r"`(facediff export [^`]*)`|^\$ (facediff export .*)$", page.read_text(), re.MULTILINE)
-    for line in line
-    if line and "-o" in line
-}
 
 
 def test_the_table_of_formats_is_complete() -> None:

@@ -21,7 +21,6 @@ from facediff.metrics import (
 from facediff.metrics.mouth import correlation
 
 Anything = Any  # right and wrong speech
-ADDED = {"waveform": torch.ones(2, 80), "intensity": torch.ones(2, 8)}
 
 
 def motion(seed: int, batch: int = 2, frames: int = 8) -> torch.Tensor:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import settings
-from hypothesis import strategies as st
 
 from facediff.metrics import (
     IdentityDiversity,
@@ -13,11 +11,6 @@ from facediff.metrics import (
     identity_diversity,
     sample_diversity,
 )
-
-few = settings(max_examples=25, deadline=None)
-seeds = st.integers(0, 2**31)
-counts = st.integers(1, 5)
-LIPS = [0, 3]
 
 
 def samples(seed: int, count: int = 4, frames: int = 6) -> torch.Tensor:

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +57,6 @@ def published(checkpoint: Path) -> Path:
 @pytest.fixture
 def copy(published: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(published, tmp_path / "model"))
-
-
-def change(folder: Path, edit: Callable[[dict[str, Any]], object]) -> Path:
-    config = json.loads((folder / "config.json").read_text())
-    edit(config)
-    (folder / "config.json").write_text(json.dumps(config))
-    return folder
 
 
 def motion(source: Path) -> torch.Tensor:

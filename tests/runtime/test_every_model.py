@@ -21,7 +21,7 @@ from facediff.models import AnimationModel
 from facediff.models.graphs import Graph
 from facediff.pipelines.export_model import arrays_of, describe, export_model, record
 from facediff.runtime import RuntimeModel
-from facediff.speech.windows import LOW_LATENCY, WindowPlan
+from facediff.speech.windows import WindowPlan
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.tiny import RATE, SEEN, UNSEEN, VERTICES, Tiny
 from tests.models.published.conftest import METHODS
@@ -195,15 +195,6 @@ def test_direct_model_has_no_samples_around_a_mean(tiny_root: Path) -> None:
     runtime = in_eager(ready("style content", tiny_root, {}))
     with pytest.raises(FaceDiffError, match="expressivity"):
         runtime.animate(sound(1.0), expressivity=0.5)
-
-
-@pytest.mark.parametrize("case", ["style content", "Voca"])
-@pytest.mark.slow
-def test_low_latency_is_that_of_the_model(case: str, tiny_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = ready(case, tiny_root, {})
-    runtime = in_eager(model)
-    monkeypatch.setattr(f"{__name__}.PLAN", LOW_LATENCY)
-    assert_alike(runtime, model, 2.513, "B", seed=1)
 
 
 class Branching(torch.nn.Module):

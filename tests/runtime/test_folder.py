@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -96,10 +95,6 @@ def test_displacements_take_16_bits() -> None:
     packed, scales = packed_deltas(rigs)
     sizes = np.abs(rigs).max((2, 3))[..., None, None]
     assert (np.abs(packed * scales[..., None, None] - rigs) <= sizes / 65_000).all()
-
-
-def spoilt(record: str, value: object) -> dict[str, Any]:
-    return {**CHANNELS.state(), record: value}
 
 
 @pytest.mark.parametrize(

@@ -36,10 +36,6 @@ def bent(*nodes: onnx.NodeProto, tensors: list[onnx.TensorProto] | None = None, 
     return change
 
 
-def total(value: str = "grown") -> onnx.NodeProto:
-    return node("ReduceSum", value, "spoilt", keepdims=0)
-
-
 def body() -> onnx.GraphProto:
     ends = [helper.make_tensor_value_info("b", FLOAT, [])]
     return helper.make_graph([node("Constant", "", "b", value_float=1.0)], "body", [], ends)

@@ -403,20 +403,6 @@ def test_damaged_folder_is_refused(case: str, folder: Path, tmp_path: Path) -> N
         RuntimeModel.open(tmp_path / "copy")
 
 
-REFUSED = {
-    "--sampler ddim": "--sampler",
-    "--steps 3": "--steps",
-    "--guidance style=1.5": "--guidance",
-    "--precision bf16": "--precision",
-    "--device cuda": "--device",
-    "--expressivity lips=0.5": "--expressivity",
-    "--style nobody.npz": "--style nobody.npz",
-    "--identity Z": "--identity",
-    "--window 0.1": "window",
-}
-"""Options that an exported model cannot follow, and what the error of both commands names."""
-
-
 @pytest.mark.parametrize(("precision", "stored"), [("float16", "FLOAT16"), ("int8", "INT8"), ("float32", "FLOAT")])
 def test_only_what_was_learnt_is_stored_in_fewer_bits(precision: Precision, stored: str) -> None:
     """A linear map's weights are learnt, in a graph as their transpose; the kernel of a transform is not."""

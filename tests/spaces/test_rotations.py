@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation, Slerp
 
 from facediff.spaces.rotations import convert, slerp
 from facediff.spaces.space import Form
 
 FORMS: tuple[Form, ...] = ("axis_angle", "six_d", "quaternion", "euler")
-ANGLES = hnp.arrays(np.float64, (4, 3), elements=st.floats(-3.1, 3.1))
 
 
 def reference(rotations: Rotation, form: Form) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +15,9 @@ import pytest
 from facediff.animation import read_archive, write_archive
 from facediff.cli.app import main
 from facediff.render import video as encoding
-from facediff.study import StudyOptions, plan_study, read_study
+from facediff.study import read_study
 from facediff.study.definition import DATABASE, Trial
-from facediff.study.page import page_of
 from facediff.study.store import AnswerStore
-from tests.fakes.processes import Forked, program
 from tests.fakes.study import write_methods
 from tests.fakes.tiny import write_tiny
 
@@ -204,23 +201,6 @@ def test_a_full_disk_leaves_no_study_and_the_next_run_continues(
     assert "study make" in capsys.readouterr().err
     assert make(*FEW) == 0
     assert "3 up to date" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_killed_and_started_again_it_is_the_same_study(place: Path) -> None:
-    options = StudyOptions(clips=["A_one"], still_controls=1, same_controls=0, repeats=0, size=32, languages=["en"])
-    whole = plan_study({name: place / name for name in ("ours", "theirs")}, options, truth=place / "truth").study
-    words = ["study", "make", "ours=ours", "theirs=theirs", "--truth", "truth", "-o", "study", *SMALL, *FEW]
-    process = Forked(program("facediff", *words), cwd=place)
-    end = time.monotonic() + 60
-    while not list((place / "study").rglob("*.mp4")) and process.poll() is None and time.monotonic() < end:
-        time.sleep(0.01)
-    process.kill()
-    assert make(*FEW) == 0
-    assert read_study(place / "study").id == whole.id
-    assert {path.name for path in (place / "study").rglob("*.mp4")} == set(whole.videos())
-    assert (place / "study" / "page" / "index.html").read_text(encoding="utf-8") == page_of(whole)
-    assert not [path for path in (place / "study").rglob("*") if ".partial-" in path.name or path.suffix == ".lock"]
 
 
 def test_a_study_that_was_changed_is_noticed(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

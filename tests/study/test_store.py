@@ -19,7 +19,6 @@ from facediff.study.answers import Answer
 from facediff.study.store import AnswerStore, FullError
 from tests.fakes.study import SCORES, small_study, write_answers
 
-HOSTILE = "'); DROP TABLE answers; -- \"<script>alert(1)</script>\n=cmd() \u202e 😀"
 TOKEN = "0123456789abcdef" * 2
 
 

@@ -303,7 +303,6 @@ def test_a_flawed_folder_gets_one_sentence(
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--name", "my_name"], "--name 'my_name': expected letters, digits and dashes"),
         (["--name", "../up"], "expected letters"),
         (["--name", "anna"], "has a speaker of that name already"),
         (["--frame-rate", "60"], "expected the same stretch of video; check --frame-rate"),
@@ -313,11 +312,9 @@ def test_a_flawed_folder_gets_one_sentence(
         (["--template", "{tmp}/small.npy"], r"small\.npy: has 4 vertices"),
         (["--template", "{tmp}/metres.npy"], r"metres\.npy: is 0\.001 times as large as the faces of the motion"),
         (["--template", "{tmp}/other.npy"], r"other\.npy: (is|does not lie)"),
-        (["--template", "{tmp}/zeros.npy"], r"zeros\.npy: alignment: the points do not determine a rotation"),
         (["--stable", "{tmp}/beyond.txt"], r"beyond\.txt: .*360"),
         (["--stable", "{tmp}/line.txt"], r"line\.txt: names 2 vertices; expected at least 10"),
         (["-o", "{tmp}/full"], "full: is not empty"),
-        (["-o", "{tmp}/silent.wav/out"], "cannot be written"),
     ],
 )
 def test_a_wrong_option_gets_one_sentence(brief: Path, tmp_path: Path, options: list[str], sentence: str) -> None:
@@ -326,7 +323,6 @@ def test_a_wrong_option_gets_one_sentence(brief: Path, tmp_path: Path, options: 
     soundfile.write(tmp_path / "silent.wav", np.zeros(16000 * 8), 16000)
     np.save(tmp_path / "small.npy", np.zeros((4, 3)))
     np.save(tmp_path / "metres.npy", face())
-    np.save(tmp_path / "zeros.npy", np.zeros((VERTICES, 3)))
     np.save(tmp_path / "other.npy", 1000 * face()[::-1])
     (tmp_path / "beyond.txt").write_text("1, 2, 360")
     (tmp_path / "line.txt").write_text("5, 6")
