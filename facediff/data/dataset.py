@@ -534,11 +534,16 @@ class MotionDataset(Dataset[Sample]):
         return features[first : max(first + 1, math.ceil(stop * per_frame))].float()
 
     def _decoy(self, index: int, frames: int) -> Tensor | None:
-        """Speech of the next clip with another sentence, repeated or cut to ``frames``; None if there is none."""
-        order = self.clips[index + 1 :] + self.clips[:index]
-        clip = next((clip for clip in order if clip.sentence != self.clips[index].sentence), None)
-        if clip is None:
+        """Speech of the next clip with another sentence, repeated or cut to ``frames``; None if there is none.
+
+        Neither the sentence's name nor its text, where that is known, may be the same.
+        """
+        order = [*range(index + 1, len(self.clips)), *range(index)]
+        sentence, text = self.clips[index].sentence, self.says(index)
+        other = next((k for k in order if self.clips[k].sentence != sentence and self.says(k) != text), None)
+        if other is None:
             return None
+        clip = self.clips[other]
         audio = self.corpus.read_audio(clip, 0, self.corpus.frames(clip))
         length = samples_for(frames, self.corpus.frame_rate)
         return audio.repeat(-(-length // len(audio)))[:length]

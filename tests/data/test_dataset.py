@@ -97,9 +97,15 @@ def test_decoys_say_something_else_and_are_as_long(tiny: Tiny) -> None:
         assert not torch.equal(sample.decoy_audio, sample.audio)
 
 
-def test_a_decoy_is_the_next_clip_with_other_words(tiny: Tiny) -> None:
-    clips = [tiny.corpus.clips[name] for name in ("A_e01", "B_e01", "A_e02")]
-    dataset = MotionDataset(tiny.corpus, clips, tiny.identities, tiny.reference_policy(), training=False, decoys=True)
+@pytest.mark.parametrize("texts", [None, ["one", "two", "three"], ["one", "one", "three"]])
+@pytest.mark.parametrize("second", ["B_e01", "B_e03"])
+def test_a_decoy_is_the_next_clip_with_other_words(second: str, texts: list[str] | None, tiny: Tiny) -> None:
+    clips = [tiny.corpus.clips[name] for name in ("A_e01", second, "A_e02")]
+    if second == "B_e03" and (texts is None or texts[0] != texts[1]):
+        clips[1] = clips[0]
+    dataset = MotionDataset(
+        tiny.corpus, clips, tiny.identities, tiny.reference_policy(), training=False, decoys=True, texts=texts
+    )
     other = tiny.corpus.read_audio(clips[2], 0, tiny.corpus.frames(clips[2]))
     for index in (0, 1):
         decoy = dataset[index].decoy_audio
