@@ -76,7 +76,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """One corpus, one test split."""
+    """One corpus, one test split, or the ``shares`` of its clips that were tested."""
 
     corpus: str
     label: str
@@ -91,11 +91,13 @@ class Table:
     regions: Mapping[str, Any]
     notes: list[str]
     published: PublishedScores
+    shares: tuple[float, ...] = ()
 
     @property
     def title(self) -> str:
         """Corpus and split in words."""
-        return f"{self.label}, {SPLIT_LABELS.get(self.split, self.split)}"
+        some = "".join(f", a sub-sample of {100 * share:.4g} %" for share in self.shares)
+        return f"{self.label}, {SPLIT_LABELS.get(self.split, self.split)}{some}"
 
     def row(self, name: str) -> TableRow:
         """A row by its name."""
@@ -188,6 +190,7 @@ def _table(
     if all(row.name != baseline for row in rows):  # the mean of a method that draws no samples
         baseline = compared_with
     rows = _with_comparisons(rows, columns, baseline, bootstrap)
+    tested = [_row_of(result, split, "model") for result in results]
     scored = _row_of(first, split, "model") or {}
     clips = {clip for row in rows for scores in row.scores.values() for clip in scores.clips}
     regions = dict(scored.get("regions") or {})
@@ -218,6 +221,7 @@ def _table(
         regions=regions,
         notes=[*_notes(rows, columns, len(clips), manifests), *_shuffled_notes(rows, columns, bootstrap)],
         published=published,
+        shares=tuple(sorted({row["test_share"] for row in tested if row and "test_share" in row})),
     )
 
 

@@ -17,7 +17,7 @@ from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_med
 from facediff.data import SpeechMotionDataModule
 from facediff.errors import counted, note, number
 from facediff.models import AnimationModel
-from facediff.models.evaluation import METHODS
+from facediff.models.evaluation import METHODS, count_generations
 from facediff.models.inference import Prediction
 from facediff.utils.files import atomic
 from facediff.utils.hints import checks_arguments
@@ -90,17 +90,14 @@ class ScoreTable(Callback):
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(pl_module, AnimationModel) or data is None or not trainer.is_global_zero:
             return
-        turns = len(pl_module.identities) if pl_module.unseen_identity == "each_seen" else 1
-        draws = pl_module.test_samples * (pl_module.samples and pl_module.test_samples > 1)
-        of_clip = {True: 2 + draws, False: turns * (2 + draws)}  # each once more with another clip's speech
-        splits = pl_module.evaluation.splits
-        count = sum(of_clip[clip.identity in pl_module.identities] for split in splits for clip in data.clips(split))
+        samples = pl_module.test_samples if pl_module.samples else 1
+        count = count_generations(data, pl_module.unseen_identity, samples)
         steps = int(getattr(getattr(pl_module, "sampler", None), "steps", 1))
         if count * steps > MANY_STEPS:
             note(
                 f"the test generates about {number(count)} animations of {counted(steps, 'sampling step')}; fewer: "
-                f"--model.unseen_identity=style_only, --model.test_samples, --trainer.limit_test_batches, or "
-                f"--model.sampler.steps"
+                f"--data.test_share, --model.unseen_identity=style_only, --model.test_samples, or "
+                f"--model.sampler.steps; faster: --data.batch_size"
             )
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -178,7 +175,8 @@ def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool,
     """The scores as text, one row per split and method, with regions, frames and clips."""
     names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
     kind = "SYNTHETIC corpus" if synthetic else "corpus"
-    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen speakers: {rows[0]['unseen_identity']}"]
+    share = f"; {100 * rows[0]['test_share']:.4g} % of the test clips, a sub-sample" if "test_share" in rows[0] else ""
+    lines = [f"\n{kind} {corpus}, protocol {rows[0]['protocol']}, unseen speakers: {rows[0]['unseen_identity']}{share}"]
     for region in rows[0]["regions"].values():
         lines.append(f"region {region['name']}: {region['count']} vertices, hash {region['hash']}")
     head = ["split", "method", *map(str.upper, names), "frames", "clips"]

@@ -5,6 +5,8 @@ A corpus adds its facts (class attributes) and decides which clip belongs to whi
 
 from __future__ import annotations
 
+import hashlib
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
@@ -122,6 +124,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             possible with the same attributes (such as the mood), or the target itself.
         reference_frames: longest style reference, in frames.
         predict_split: the split that ``predict`` runs over; the first test split if None.
+        test_share: share of the clips of each test split that are tested, the same ones in every run, by a hash of
+            their names; tables of such a test say so.
         augmentations: changes of training speech by name with their options, such as ``[voice:semitones=4, room,
             noise]``, in this order; see docs/voices.md.
         augmented_share: share of the training clips to which they are applied; the others stay as recorded.
@@ -182,6 +186,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         reference: ReferenceChoice = "same_subject",
         reference_frames: Count = 100,
         predict_split: Split | None = None,
+        test_share: Annotated[float, Range(0, 1, above=True)] = 1.0,
         augmentations: list[str] | None = None,
         augmented_share: Annotated[float, Range(0, 1)] = 1.0,
         augmented_clips: dict[str, str] | None = None,
@@ -207,6 +212,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.reference: ReferenceChoice = reference
         self.reference_frames = reference_frames
         self.predict_split = predict_split
+        self.test_share = test_share
         self.augmenter: Augmenter | None = None
         if augmentations:
             self.augmenter = Augmenter(read_augmentations(augmentations), augmented_share)
@@ -427,10 +433,13 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         return [split for split in get_args(Split)[2:] if self.clips(split)]
 
     def clips(self, split: str) -> list[Clip]:
-        """The clips of a split, sorted by name."""
+        """The clips of a split, sorted by name; of a test split, those of its ``test_share``."""
         clips = [clip for clip in self.corpus.clips.values() if self.find_split(clip) == split]
         if split == "train" and self.train_identities is not None:
             clips = [clip for clip in clips if clip.identity in self.train_identities]
+        if split.startswith("test") and self.test_share < 1:
+            clips.sort(key=lambda clip: hashlib.sha256(clip.name.encode()).digest())
+            clips = sorted(clips[: math.ceil(self.test_share * len(clips))], key=lambda clip: clip.name)
         return clips
 
     def find_split(self, clip: Clip) -> str | None:

@@ -30,7 +30,7 @@ from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.channel_weights import ChannelWeights, channel_weights
 from facediff.models.checkpoint import checked_file
 from facediff.models.checkpoint_content import MotionScale, PersonStyles, StyleSource
-from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, with_usual_styles
+from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, to_shuffle, with_usual_styles
 from facediff.models.inference import Prediction, noise_stream
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.motion_space import PrincipalComponents, Projection
@@ -344,9 +344,9 @@ class AnimationModel(PersonStyles, ABC):
             if self.samples and self.test_samples > 1:
                 samples = torch.stack([self.generate(view, seed=seed) for seed in range(self.test_samples)])
                 self.evaluation.update(split, "sample_mean", samples.mean(0), view, name)
-            if view.decoy_audio is not None:
-                decoy = replace(view, audio=view.decoy_audio, features=None)
-                self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), view, name)
+            if (some := to_shuffle(name, view, self.identities)) is not None and some.decoy_audio is not None:
+                decoy = replace(some, audio=some.decoy_audio, features=None)
+                self.evaluation.update(split, "shuffled", self.generate(decoy, seed=0), some, name)
         # A test gives every clip a reference of its own speaker and mood; an animation has none.
         for view in with_usual_styles(batch, self.default_style) if self.style_of(batch).shape[1] else ():
             self.evaluation.update(split, "usual_style", self.generate(view, seed=0), view)

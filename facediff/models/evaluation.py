@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -96,6 +97,31 @@ def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]
         if clips and (not isinstance(style, Style) or style.vector.numel()):
             views.append(with_identity(batch.select(clips), int(batch.identity[clips[0]]), style))
     return views
+
+
+def to_shuffle(name: str, view: Batch, identities: Sequence[str]) -> Batch | None:
+    """The clips of a view of :func:`conditioned` that are tested with another sentence's speech; None if none is.
+
+    Every clip is so once: under each identity that an unseen speaker is conditioned on, it would double a test's time.
+    The hash of the clip's name decides under which.
+    """
+    turns = [identities[zlib.crc32(clip.encode()) % len(identities)] for clip in view.names]
+    clips = [index for index, turn in enumerate(turns) if name in ("", turn)]
+    return view.select(clips) if clips and view.decoy_audio is not None else None
+
+
+def count_generations(data: SpeechMotionDataModule, policy: str, samples: int) -> int:
+    """How many animations a test generates, without what further metrics and the usual style need.
+
+    Args:
+        data: the corpus.
+        policy: an :data:`IdentityPolicy`.
+        samples: of each clip for the mean of several; 1 for none.
+    """
+    turns = len(data.identities) if policy == "each_seen" else 1
+    of_view = 1 + (samples if samples > 1 else 0)
+    clips = [clip for split in data.test_splits for clip in data.clips(split)]
+    return sum((1 if clip.identity in data.identities else turns) * of_view + 1 for clip in clips)
 
 
 METHODS = {
@@ -483,6 +509,8 @@ class Evaluation:
                     with contextlib.suppress(ValueError):  # no value on any sequence
                         scores[name] = float(self.chosen[split][method][name].compute())
             facts = {"split": split, "method": method, "unseen_identity": self.unseen_identity}
+            if self.corpus.data is not None and self.corpus.data.test_share < 1 and split != "val":
+                facts["test_share"] = self.corpus.data.test_share
             table.append({**facts, **scores, **summary.as_dict()})
         return table
 

@@ -75,6 +75,17 @@ def test_a_method_that_a_still_face_beats_is_noted() -> None:
     assert any("no method is better than this reference: still face" in note for note in report.tables[0].notes)
 
 
+def test_a_sub_sample_is_named_wherever_a_table_is_printed() -> None:
+    found = results()
+    some = [
+        dataclasses.replace(result, scores=[{**row, "test_share": 0.125} for row in result.scores]) for result in found
+    ]
+    for tested, named in ((found, False), (some, True)):
+        report = report_of(outline(), tested, resamples=50)
+        printed = (text(report), latex_tables(report), markdown(document(report)))
+        assert [re.search(r"a sub-sample of 12\.5 \\?%", each) is not None for each in printed] == [named] * 3
+
+
 def test_the_mean_of_samples_is_a_row_that_others_are_compared_with() -> None:
     """Of the methods that draw samples alone; a method is found by the mean's name where it has none."""
     nan = float("nan")

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Callable
 
 import pytest
 from lightning.pytorch import Trainer
+from lightning.pytorch.loggers import CSVLogger
 
 from facediff.callbacks import outputs
 from facediff.errors import Note
 from facediff.models import DualPathDiffusion
+from facediff.utils.plain_files import load_json
 from tests.fakes.tiny import Tiny
 
 
@@ -43,5 +46,32 @@ def test_what_a_test_generates_is_told(
     (said,) = [str(each.message) for each in caught if issubclass(each.category, Note)]
     found = re.search(r"about (\d+) animations of (\d+) sampling steps", said)
     assert found is not None
-    assert int(found[1]) <= sum(calls) <= 2 * int(found[1])  # a clip's usual style comes on top
+    clips = sum(len(tiny.clips(split)) for split in tiny.test_splits)
+    assert 0 <= sum(calls) - int(found[1]) <= clips  # a clip's usual style comes on top
     assert found[2] == "3"
+
+
+def test_a_sub_sample_is_tested_and_named(
+    make_model: Callable[..., DualPathDiffusion],
+    tiny_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    whole, some = Tiny(root=str(tiny_root)), Tiny(root=str(tiny_root), test_share=0.3)
+    for split in whole.test_splits:
+        names, all_names = ([clip.name for clip in data.clips(split)] for data in (some, whole))
+        assert len(names) == math.ceil(0.3 * len(all_names))
+        assert names == [name for name in all_names if name in names]
+    assert [some.clips(split) for split in ("train", "val")] == [whole.clips(split) for split in ("train", "val")]
+    model = make_model()
+    model.adopt(some.assets().with_motion_scale(some.motion_scale()))
+    trainer = Trainer(
+        accelerator="cpu", logger=CSVLogger(tmp_path), enable_progress_bar=False, enable_model_summary=False,
+        callbacks=[outputs.ScoreTable(media_clips=0)], enable_checkpointing=False,
+    )  # fmt: skip
+    trainer.test(model, datamodule=some, verbose=False)
+    assert "30 % of the test clips, a sub-sample" in capsys.readouterr().out
+    report = load_json(Path(trainer.log_dir or "") / "test_report.json")
+    assert {row["test_share"] for row in report["scores"]} == {0.3}
+    tested = {row["clip"] for row in report["sequences"]}
+    assert tested == {clip.name for split in some.test_splits for clip in some.clips(split)}
