@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from facediff.cli.options import OutputFolder, Scheduler, Seed, Workers
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, check_known, counted
+from facediff.errors import FaceDiffError, check_known, counted, number
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.benchmark import BenchmarkPlan, BenchmarkReport, Cell
     from facediff.benchmark.running import Setting
+    from facediff.cli.lightning_cli import Parsed
     from facediff.data import SpeechMotionDataModule
 
 RESAMPLES = 2000
@@ -70,9 +71,9 @@ def benchmark(
     count = (
         workers or definition.workers or (None if is_cluster(scheduler) else max(1, processors() // definition.threads))
     )
-    setting = check_cells(definition, cells, left, folder, dry_run=dry_run)
+    setting, tests = check_cells(definition, left, folder, dry_run=dry_run)
     seconds = estimate(left, folder)
-    announce(definition, cells, left, seconds, count)
+    announce(definition, cells, left, seconds, tests, count)
     if dry_run:
         return 0
     roots = [word for folder_of_corpus in root or [] for word in ("--root", folder_of_corpus)]
@@ -155,17 +156,21 @@ def announce(
     cells: Sequence[Cell],
     left: Sequence[Cell],
     seconds: Mapping[Cell, float | None],
+    tests: Mapping[tuple[str, str], str],
     workers: int | None,
 ) -> None:
-    """List the cells that will run, with times."""
+    """List the cells that will run, with what their tests generate and with times."""
     from facediff.utils.text_tables import format_table
 
     at_a_time = f"{workers} at a time" if workers else "one on each worker at a time"
     tell(f"{plan.title}: {counted(len(cells), 'cell')}, {len(cells) - len(left)} done, {len(left)} to run, {at_a_time}")
     if not left:
         return
-    rows = [[str(cell), cell.kind, None if seconds[cell] is None else f"{seconds[cell]:.0f} s"] for cell in left]
-    tell(*format_table(["to run", "", "last time"], rows, left=2).split("\n"))
+    last = [None if seconds[cell] is None else f"{seconds[cell]:.0f} s" for cell in left]
+    rows = [
+        [str(cell), cell.kind, tests.get((cell.row, cell.corpus)), time] for cell, time in zip(left, last, strict=True)
+    ]
+    tell(*format_table(["to run", "", "test generates", "last time"], rows, left=2).split("\n"))
     timed = [value for value in seconds.values() if value is not None]
     untimed = len(left) - len(timed)
     if timed:
@@ -198,20 +203,25 @@ def write_and_tell(
 
 
 def check_cells(
-    plan: BenchmarkPlan, cells: Sequence[Cell], left: Sequence[Cell], folder: Path, *, dry_run: bool
-) -> Setting:
-    """Parse every command to be run, find every corpus, and make the built-in one; the setting of all cells."""
+    plan: BenchmarkPlan, left: Sequence[Cell], folder: Path, *, dry_run: bool
+) -> tuple[Setting, dict[tuple[str, str], str]]:
+    """Parse every command to be run, find every corpus, and make the built-in one.
+
+    Returns:
+        the setting of all cells, and how much the tests of trained rows generate, by row and corpus.
+    """
     from facediff.benchmark.running import Setting, fit_options, option_words
     from facediff.cli.lightning import parse_fit
 
     setting = Setting(folder, plan.protocol, plan.metrics, plan.weights, plan.threads)
-    parsed: set[str] = set()
+    parsed: dict[str, tuple[Parsed, Parsed]] = {}
     prepared: dict[str, SpeechMotionDataModule] = {}
     clips: dict[str, dict[str, str]] = {}
     truths: dict[str, tuple[str, ...]] = {}
     classes: dict[str, str] = {}
     models: dict[str, str] = {}
     roots: dict[str, str] = {}
+    tests: dict[tuple[str, str], str] = {}
     kinds: dict[str, type[SpeechMotionDataModule]] = {}
     for cell in left:
         for training in cell.trainings:
@@ -222,16 +232,18 @@ def check_cells(
             }
             command_line = ["--config", str(training.config), *option_words({**options, "seed_everything": 0})]
             mark = " ".join(command_line)
-            if mark in parsed:
-                continue
-            parsed.add(mark)
             with naming(plan, cell):
-                model_class, class_path, arguments = parse_fit(command_line)
+                if mark not in parsed:
+                    parsed[mark] = parse_fit(command_line)
+                (model_class, model_options), (class_path, arguments) = parsed[mark]
                 if not model_class.startswith("facediff."):
                     models[cell.row] = model_class
                 if not class_path.startswith("facediff."):
                     classes[cell.corpus] = class_path
-                kinds[cell.corpus] = type(data_of(prepared, class_path, arguments, make=not dry_run))
+                data = data_of(prepared, class_path, arguments, make=not dry_run)
+                kinds[cell.corpus] = type(data)
+                if (cell.row, cell.corpus) not in tests and data.root.is_dir():
+                    tests[cell.row, cell.corpus] = cost_of_test(cell, model_options, data)
         if cell.kind == "checkpoint" and cell.data is not None:
             class_path, arguments = read_data(cell.data)
             kinds[cell.corpus] = data_class(class_path)
@@ -251,7 +263,27 @@ def check_cells(
         if cell.kind == "checkpoint":
             with naming(plan, cell):
                 check_checkpoint(cell, kinds.get(cell.corpus), classes.get(cell.corpus), roots.get(cell.corpus))
-    return replace(setting, clips=clips, truths=truths, classes=classes, models=models, roots=roots)
+    return replace(setting, clips=clips, truths=truths, classes=classes, models=models, roots=roots), tests
+
+
+def cost_of_test(cell: Cell, model: Mapping[str, Any], data: SpeechMotionDataModule) -> str:
+    """How many animations of how many sampling steps a trained cell's test generates, in words.
+
+    Args:
+        cell: it.
+        model: options of the model, those of its parts by names with dots.
+        data: the corpus in training.
+    """
+    from facediff.models.evaluation import count_generations
+
+    tested = {name.removeprefix("data."): value for name, value in cell.test_options.items()}
+    data = type(data)(**{name: tested.get(name, value) for name, value in data.hparams.items()})
+    tested = {name.removeprefix("model."): value for name, value in cell.test_options.items()}
+    policy, samples = (
+        tested.get(name, model.get(name, usual)) for name, usual in (("unseen_identity", ""), ("test_samples", 1))
+    )
+    steps = tested.get("sampler.steps", model.get("sampler.init_args.steps"))
+    return number(count_generations(data, policy, samples)) + (f" × {counted(steps, 'step')}" if steps else "")
 
 
 @contextmanager

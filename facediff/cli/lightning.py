@@ -30,7 +30,7 @@ from facediff.utils.hints import defaults
 from facediff.utils.hub import check_model_source, check_training_source, local_model
 
 if TYPE_CHECKING:
-    from facediff.cli.lightning_cli import FaceDiffCLI
+    from facediff.cli.lightning_cli import FaceDiffCLI, Parsed
     from facediff.data import SpeechMotionDataModule
 
 HELP = """usage: facediff {name} [--config FILE] [--OPTION=VALUE ...]
@@ -126,8 +126,8 @@ def keep_freed_memory() -> bool:
     return bool(tell_malloc(mmap_max, 0) and tell_malloc(trim_threshold, 2**31 - 1))
 
 
-def parse_fit(arguments: Sequence[str]) -> tuple[str, str, dict[str, Any]]:
-    """Check the words of ``facediff fit`` without running it; class of the model, class and options of the data."""
+def parse_fit(arguments: Sequence[str]) -> tuple[Parsed, Parsed]:
+    """Check the words of ``facediff fit`` without running it; class and options of the model, and of the data."""
     options = checked_words("fit", arguments)
     from facediff.cli.lightning_cli import parse_lightning_cli
 

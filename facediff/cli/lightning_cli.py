@@ -107,13 +107,17 @@ def parsing(arguments: Sequence[str], experiment: str) -> Iterator[None]:
         sys.argv = argv
 
 
-def parse_lightning_cli(arguments: Sequence[str]) -> tuple[str, str, dict[str, Any]]:
-    """Parse the words of ``fit``, and instantiate nothing; class of the model, class and options of the data."""
+Parsed = tuple[str, dict[str, Any]]
+"""Class path and options of a component."""
+
+
+def parse_lightning_cli(arguments: Sequence[str]) -> tuple[Parsed, Parsed]:
+    """Parse the words of ``fit``, and instantiate nothing; the model and the data."""
     with parsing(arguments, "benchmark"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         parsed = ParsedCLI(save_config_callback=None, command="fit", experiment="benchmark", run=False)
-    data = parsed.options["data"]
-    return str(parsed.options["model"]["class_path"]), str(data["class_path"]), dict(data.get("init_args") or {})
+    model, data = (parsed.options[name] for name in ("model", "data"))
+    return tuple((str(part["class_path"]), dict(part.get("init_args") or {})) for part in (model, data))
 
 
 def restores(error: BaseException) -> bool:

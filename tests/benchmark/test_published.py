@@ -80,7 +80,7 @@ def test_the_data_of_a_plan_have_the_split_of_the_figures_that_it_quotes(path: P
         if (data_words := f"{config_content(training.config)['data']} {words[2:]}") in parsed:
             continue
         parsed.add(data_words)
-        _, class_path, arguments = parse_fit(words)
+        _, (class_path, arguments) = parse_fit(words)
         data = data_class(class_path)(**{**arguments, "root": str(tmp_path)})
         clips = [clip for name in CLIPS[cell.corpus] if (clip := data.parse_name(name)) is not None]
         assert table.split in {data.split_of(clip) for clip in clips}, (cell.row, training.config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,7 @@ def test_a_model_folder_is_tested_where_the_plans_data_are(published: Path, tiny
     (folder / "plan.yaml").write_text("corpora: {tiny: {data: data.yaml}}\nmethods: {a: {checkpoint: published}}\n")
     plan = read_plan(folder / "plan.yaml")
     cells = cells_of(plan)
-    found = check_cells(plan, cells, cells, folder / "out", dry_run=True)
+    found, _ = check_cells(plan, cells, folder / "out", dry_run=True)
     assert (found.roots, found.classes) == ({"tiny": str(tiny_root)}, {"tiny": "tests.fakes.tiny.Tiny"})
     assert not (folder / "out").exists()
 
@@ -56,6 +57,20 @@ def test_a_checkpoint_of_another_corpus_or_of_none_is_refused(
     assert not more
     assert ("row_1" in line) == bool(named)
     assert not (folder / "out").exists()
+
+
+def test_a_dry_run_tells_what_tests_generate(tiny_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, tests = tiny_root.parent / "plan", {"a": "", "b": "model.unseen_identity: each_seen"}
+    tests |= {"c": "model.test_samples: 3, model.sampler.steps: 4", "d": "data.test_share: 0.2"}
+    folder.mkdir()
+    (folder / "data.yaml").write_text(f"class_path: tests.fakes.tiny.Tiny\ninit_args: {{root: {tiny_root}}}\n")
+    rows = [f"  {k}: {{config: configs/experiment/puppet.yaml, test_options: {{{o}}}}}" for k, o in tests.items()]
+    head = ["seeds: [0, 1]", "corpora: {tiny: {data: data.yaml}}", "methods:"]
+    (folder / "plan.yaml").write_text("\n".join([*head, *rows]))
+    assert main(["benchmark", str(folder / "plan.yaml"), "-o", str(folder / "out"), "--dry-run"]) == 0
+    told = dict(re.findall(r"^(\w) on tiny, seed 1 +fit +(\d+ × \d+ steps)", capsys.readouterr().out, re.MULTILINE))
+    # 4 clips of A and B, 2 of C, whom each_seen turns into A and into B; each once more with another's speech.
+    assert told == {"a": "12 × 10 steps", "b": "14 × 10 steps", "c": "30 × 4 steps", "d": "4 × 10 steps"}
 
 
 @pytest.mark.parametrize("name", ["facediff.data.Biwii", "tests.fakes.tiny.Tinyy"])
