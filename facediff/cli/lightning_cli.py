@@ -116,8 +116,9 @@ def parse_lightning_cli(arguments: Sequence[str]) -> tuple[Parsed, Parsed]:
     with parsing(arguments, "benchmark"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         parsed = ParsedCLI(save_config_callback=None, command="fit", experiment="benchmark", run=False)
-    model, data = (parsed.options[name] for name in ("model", "data"))
-    return tuple((str(part["class_path"]), dict(part.get("init_args") or {})) for part in (model, data))
+    parts = (parsed.options[name] for name in ("model", "data"))
+    model, data = ((str(part["class_path"]), dict(part.get("init_args") or {})) for part in parts)
+    return model, data
 
 
 def restores(error: BaseException) -> bool:

@@ -6,6 +6,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from lightning.pytorch import Trainer
@@ -54,6 +55,7 @@ def test_what_a_test_generates_is_told(
 def test_a_sub_sample_is_tested_and_named(
     make_model: Callable[..., DualPathDiffusion],
     tiny_root: Path,
+    make_trainer: Callable[..., Trainer],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -65,10 +67,7 @@ def test_a_sub_sample_is_tested_and_named(
     assert [some.clips(split) for split in ("train", "val")] == [whole.clips(split) for split in ("train", "val")]
     model = make_model()
     model.adopt(some.assets().with_motion_scale(some.motion_scale()))
-    trainer = Trainer(
-        accelerator="cpu", logger=CSVLogger(tmp_path), enable_progress_bar=False, enable_model_summary=False,
-        callbacks=[outputs.ScoreTable(media_clips=0)], enable_checkpointing=False,
-    )  # fmt: skip
+    trainer = make_trainer(logger=CSVLogger(tmp_path), callbacks=[outputs.ScoreTable(media_clips=0)])
     trainer.test(model, datamodule=some, verbose=False)
     assert "30 % of the test clips, a sub-sample" in capsys.readouterr().out
     report = load_json(Path(trainer.log_dir or "") / "test_report.json")

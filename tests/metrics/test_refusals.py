@@ -15,7 +15,7 @@ from torchmetrics import Metric
 
 from facediff import metrics as fm
 from facediff.metrics import Coverage, SequenceMetric
-from tests.metrics.further_cases import CASES, pair_batch
+from tests.metrics.further_cases import CASES, Case, pair_batch
 
 
 def motion(batch: int = 2, frames: int = 5, vertices: int = 4) -> Tensor:
@@ -134,6 +134,10 @@ GALLERY = fm.SpeakerGallery(torch.rand(4, 40, 3, generator=torch.Generator().man
 LIDS = [(3, 9), (31, 4)]
 
 
+def arguments_of(case: Case) -> Batch:
+    return lambda corpus: case.arguments(corpus, PLACES, 0)
+
+
 def speaker_batch(corpus: Corpus) -> dict[str, Any]:
     """Predictions, and whom they should show."""
     batch = PAIR(corpus)
@@ -141,7 +145,7 @@ def speaker_batch(corpus: Corpus) -> dict[str, Any]:
 
 
 EVERY: dict[str, tuple[Callable[[], Any], Batch]] = {
-    **{case.name: (case.make, lambda corpus, case=case: case.arguments(corpus, PLACES, 0)) for case in CASES},
+    **{case.name: (case.make, arguments_of(case)) for case in CASES},
     "VertexError": (fm.VertexError, PAIR),
     "ShannonIndex": (partial(fm.ShannonIndex, [0, 1]), PAIR),
     "BlinkRate": (partial(fm.BlinkRate, LIDS, frames_per_second=25), PAIR),
