@@ -26,6 +26,7 @@ from facediff.synthetic.head.mesh import QuadMesh  # noqa: E402
 from facediff.synthetic.head.parts import build_head  # noqa: E402
 from facediff.synthetic.head.people import Complexion, coloured, dressed  # noqa: E402
 from facediff.synthetic.head.rig import head_shapes  # noqa: E402
+from facediff.synthetic.performance import LIP_AT_TEETH  # noqa: E402
 
 Points = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -38,7 +39,7 @@ EXPRESSIONS: dict[str, dict[str, float]] = {
     "frown": {"browDown": 1.0, "noseSneer": 0.4, "mouthFrown": 0.7},
     "/a/": {"jawOpen": 0.5, "mouthLowerDown": 0.3},
     "/o/": {"jawOpen": 0.3, "mouthFunnel": 0.6, "mouthPucker": 0.5},
-    "/f/": {"jawOpen": 0.05, "mouthRollLower": 0.75, "mouthUpperUp": 0.34},
+    "/f/": LIP_AT_TEETH,
     "/m/": {"jawOpen": 0.15, "mouthClose": 0.15, "mouthPress": 0.45},
 }
 BLINKS: dict[str, dict[str, float]] = {

@@ -20,7 +20,7 @@ from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import samples_for
 from facediff.speech.phonemes import TimedPhoneme, phonemes_file, read_phonemes
-from facediff.synthetic.articulation import articulations
+from facediff.synthetic.articulation import PAUSE, articulations
 from facediff.synthetic.recordings import recordings_of, speakers_of
 from facediff.synthetic.voices import open_voice
 
@@ -37,14 +37,13 @@ MOST = 100
 
 def visible_sound(ipa: str) -> int:
     """The place in :data:`SOUNDS` of a phoneme; a pause for what is not known."""
-    targets = articulations(ipa)[0].targets if ipa else {}
+    sound = articulations(ipa)[0] if ipa else PAUSE
+    targets = sound.targets
     jaw, pucker = targets.get("jawOpen", 0.0), targets.get("mouthPucker", 0.0)
     if not targets:
         return 0
-    if articulations(ipa)[0].closes:
-        return 1
-    if targets.get("mouthRollLower", 0.0) > 0.5:
-        return 2
+    if sound.contact:
+        return 1 if sound.contact == "lip" else 2
     if pucker > 0.6:
         return 3
     if targets.get("mouthFunnel", 0.0) > 0.4 and jaw < 0.12:

@@ -3,7 +3,8 @@
 Sounds are described by features of the International Phonetic Alphabet (place and manner of consonants; height,
 backness and rounding of vowels), and the targets of the rig follow from the features, so that a language needs no table
 of its own. Neighbouring sounds blend by overlapping dominance functions (Cohen and Massaro, "Modeling coarticulation in
-synthetic visual speech", 1993); for p, b and m the lips meet next to any neighbour.
+synthetic visual speech", 1993). Next to any neighbour, lips meet for p, b and m, and the lower lip touches the upper
+teeth for f and v.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
@@ -23,7 +25,7 @@ _ROUND_TOP = 0.018
 _SURELY_SHUT = 0.028
 UNHURRIED = 0.11
 _CLOSING, _OPENING = (0.050, 0.070), (0.060, 0.085)
-"""Shortest and longest time in seconds that the lips take to meet and to part."""
+"""Shortest and longest time in seconds that the lower lip takes to what it touches, and away."""
 
 # Vowels: how open (0 close to 1 open), how far back (0 front to 1 back) and how rounded they are. IPA chart of 2020.
 _VOWELS: dict[str, tuple[float, float, float]] = {
@@ -65,15 +67,13 @@ class Articulation:
         strength: how much it dominates its neighbours (Cohen and Massaro's magnitude of dominance); weak sounds take
             the shape of the sounds next to them.
         reach: how far its influence spreads in time, as a factor.
-        closes: whether the lips meet.
-        firm: shapes on which it dominates fully at any strength.
+        contact: what the lower lip touches: the upper ``lip`` or ``teeth``, or nothing.
     """
 
     targets: dict[str, float]
     strength: float = 1.0
     reach: float = 1.0
-    closes: bool = False
-    firm: tuple[str, ...] = ()
+    contact: Literal["", "lip", "teeth"] = ""
 
 
 PAUSE = Articulation({}, strength=1.1, reach=0.9)
@@ -97,14 +97,8 @@ def _vowel(symbol: str) -> Articulation:
 
 
 _PLACES: dict[str, Articulation] = {
-    "bilabial": Articulation(
-        {"jawOpen": 0.06, "mouthPress": 0.45, "mouthShrugLower": 0.1}, 0.6, 0.8, True, ("mouthPress",)
-    ),
-    "labiodental": Articulation(
-        {"jawOpen": 0.05, "mouthRollLower": 0.75, "mouthUpperUp": 0.34},
-        *(1.2, 0.7, False),
-        ("mouthRollLower", "mouthUpperUp", "jawOpen"),
-    ),
+    "bilabial": Articulation({"jawOpen": 0.06, "mouthPress": 0.45, "mouthShrugLower": 0.1}, 0.6, 0.8, "lip"),
+    "labiodental": Articulation({"jawOpen": 0.07, "mouthUpperUp": 0.4}, 0.8, 0.7, "teeth"),
     "dental": Articulation(
         {"jawOpen": 0.11, "mouthLowerDown": 0.25, "mouthUpperUp": 0.12, "tongueForward": 0.9}, 0.7, 0.8
     ),
@@ -165,7 +159,7 @@ def _consonant(location: str, manner: str) -> Articulation:
     elif location == "bilabial" and manner == "stop":  # air builds up behind the lips
         sound = replace(sound, targets={**sound.targets, "mouthPress": 0.55, "cheekPuff": 0.12})
     elif location == "bilabial" and manner == "fricative":
-        sound = replace(sound, closes=False)
+        sound = replace(sound, contact="")
     elif manner == "lateral":
         sound = replace(sound, targets={**sound.targets, "jawOpen": 0.13})
     return sound
@@ -181,11 +175,12 @@ SIDED = frozenset(LEFT_AND_RIGHT)
 _BLOCK, _OUT_OF_REACH = 1024, 1.5
 """Times that are blended together, and seconds beyond which a sound's dominance is nothing (e^-15 and less)."""
 # Seconds in which dominance falls to 1/e, before and after a sound. Rounding is prepared early.
-_FALL_BEFORE = {"mouthPucker": 0.085, "mouthFunnel": 0.080, "mouthStretch": 0.070, "mouthRollLower": 0.035}
-_FALL_AFTER = {"mouthPucker": 0.070, "mouthFunnel": 0.065, "mouthStretch": 0.060, "mouthRollLower": 0.035}
+_FALL_BEFORE = {"mouthPucker": 0.085, "mouthFunnel": 0.080, "mouthStretch": 0.070}
+_FALL_AFTER = {"mouthPucker": 0.070, "mouthFunnel": 0.065, "mouthStretch": 0.060}
 _QUICK = {"mouthPress": 0.035, "tongueUp": 0.032, "tongueForward": 0.035}
 _USUAL_FALL = 0.052
-_FIRM_STRENGTH = 3.0
+_FIRM = 3.0
+"""Strength with which lips that meet press, and with which rounded sounds narrow the mouth, next to any neighbour."""
 
 
 @dataclass(frozen=True)
@@ -242,27 +237,34 @@ def _blend_block(sounds: Sequence[SpeechSound], times: Array, spread: float) -> 
     for column, shape in enumerate(SPEECH_SHAPES):
         quick = _QUICK.get(shape, _USUAL_FALL)
         fall_before, fall_after = reach * _FALL_BEFORE.get(shape, quick), reach * _FALL_AFTER.get(shape, quick)
-        strength = np.array(
-            [_FIRM_STRENGTH if shape in sound.articulation.firm else sound.articulation.strength for sound in sounds]
-        )
+        strength = np.array([_strength(sound.articulation, shape) for sound in sounds])
         dominance = strength * np.exp(-before / fall_before - after / fall_after)
         target = np.array([sound.stress * sound.articulation.targets.get(shape, 0.0) for sound in sounds])
         weights[:, column] = (dominance * target).sum(axis=1) / (dominance.sum(axis=1) + 1e-9)
     return weights
 
 
-def lip_closure(sounds: Sequence[SpeechSound], times: Array) -> Array:
-    """How firmly the lips are shut (n,), 0 to 1: 1 from before the start to past the middle of every p, b and m."""
+def _strength(sound: Articulation, shape: str) -> float:
+    pressed = shape == "mouthPress" and sound.contact == "lip"
+    rounded = shape in ("mouthPucker", "mouthStretch") and sound.targets.get("mouthPucker", 0.0) > 0.6
+    return _FIRM if pressed or rounded else sound.strength
+
+
+def lip_contact(sounds: Sequence[SpeechSound], times: Array, contact: Literal["lip", "teeth"]) -> Array:
+    """How near the lower lip is to the upper lip or teeth (n,), 0 to 1: 1 from the start to past the middle of sounds.
+
+    The sounds are p, b and m, or f and v.
+    """
     apart = np.ones_like(times)
     lengths = [sound.end - sound.start for sound in sounds]
     for index, (sound, length) in enumerate(zip(sounds, lengths, strict=True)):
-        if sound.articulation.closes:
+        if sound.articulation.contact == contact:
             start = sound.start
-            # The lips must be shut in the frame nearest to the middle, which is up to half a frame away.
+            # They must touch in the frame nearest to the middle, which is up to half a frame away.
             middle = start + 0.5 * length
             first = min(start + min(0.15 * length, 0.012), middle - _SURELY_SHUT)
             last = max(start + 0.72 * length, middle + _SURELY_SHUT)
-            # A short vowel between two closures needs time to open.
+            # A short vowel between two contacts needs time to open.
             closing = np.clip(0.55 * lengths[index - 1], *_CLOSING) if index > 0 else _CLOSING[1]
             opening = np.clip(0.55 * lengths[index + 1], *_OPENING) if index + 1 < len(lengths) else _OPENING[1]
             shut = rise(times, first - float(closing), first) * rise(times, last + float(opening), last)

@@ -62,13 +62,13 @@ _CAST = (
         *("F3", "espeak:en+f4", 1.1, 0.4, 0.8),
         Face(sex=-0.6, age=0.9, length=0.3, nose_length=0.4, cheekbones=0.3),
         Complexion("pale", "grey", "blue", "short", "wine"),
-        SpeakingHabits(jaw=0.8, rounding=0.85, slack=1.25, lead=0.0, frown=0.08, blinks=34, nods=1.5, gaze_away=0.5),
+        SpeakingHabits(jaw=0.8, rounding=0.85, slack=1.25, lead=-0.02, frown=0.08, blinks=34, nods=1.5, gaze_away=0.5),
     ),
     CastMember(
         *("M1", "espeak:en-us+m3", 1.0, -1.5, 0.9),
         Face(sex=0.9, jaw=0.3, brow_ridge=0.3, nose_bridge=0.3),
         Complexion("tan", "brown", "brown", "short", "sand", stubble=0.35),
-        SpeakingHabits(jaw=1.05, spreading=0.85, lead=0.03, inner_brow=0.35, squint=0.08, blinks=20, tilt=1.5),
+        SpeakingHabits(jaw=1.05, spreading=0.85, lead=0.01, inner_brow=0.35, squint=0.08, blinks=20, tilt=1.5),
     ),
     CastMember(
         *("M2", "espeak:en-gb-scotland+m2", 1.08, -0.6, 1.2),
@@ -98,7 +98,7 @@ _CAST = (
         *("M4", "espeak:en-us+m1", 1.04, -1.0, 1.1),
         Face(sex=1.0, weight=-0.4, length=0.3, chin=0.4, nose_length=0.4),
         Complexion("fair", "brown", "green", "short", "moss", stubble=0.3),
-        SpeakingHabits(jaw=1.0, spreading=1.05, lead=0.01, outer_brow=0.5, squint=0.05, blinks=24, tilt=-1.0),
+        SpeakingHabits(jaw=1.0, spreading=1.05, lead=-0.01, outer_brow=0.5, squint=0.05, blinks=24, tilt=-1.0),
     ),
     CastMember(
         *("M5", "espeak:en-gb-scotland+m6", 0.98, -1.8, 0.85),

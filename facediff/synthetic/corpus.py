@@ -37,7 +37,7 @@ from facediff.synthetic.cast import (
 from facediff.synthetic.head.mask import N_MASK_VERTICES, build_mask
 from facediff.synthetic.head.parts import AROUND_EYE, N_HEAD_VERTICES, build_head
 from facediff.synthetic.head.people import Complexion, coloured, dressed
-from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs
+from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs, lip_teeth_pairs
 from facediff.synthetic.performance import MOODS, FaceMotion, synthesise_motion
 from facediff.synthetic.prosody import analyse
 from facediff.synthetic.recordings import recordings_of
@@ -53,7 +53,7 @@ from facediff.utils.plain_files import read_json, write_json, write_table
 
 CORPUS = "facediff-puppet"
 MANIFEST = "manifest.json"
-GENERATOR = "2.2"
+GENERATOR = "3.0"
 FRAME_RATE = 25
 UNIT = "m"  # Of every length in the corpus
 _QUIET_BEFORE, _QUIET_AFTER = 0.10, 0.08
@@ -403,9 +403,12 @@ def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence
     for name, index in region_vertices().items():
         vertices = variant.vertices(index, region=True)
         (folder / "regions" / f"{name}.txt").write_text(", ".join(map(str, vertices.tolist())) + "\n")
-    for file, sides in (("inner_lip_pairs.txt", lip_pairs(mesh)), ("eyelid_pairs.txt", eyelid_pairs(mesh))):
-        pairs = zip(*(variant.vertices(side).tolist() for side in sides), strict=True)
-        (folder / "regions" / file).write_text("".join(f"{upper}, {lower}\n" for upper, lower in pairs))
+    pairs = {"inner_lip": lip_pairs(mesh), "eyelid": eyelid_pairs(mesh)}
+    if not variant.mask:  # which has no teeth
+        pairs["lip_teeth"] = lip_teeth_pairs(mesh)
+    for name, sides in pairs.items():
+        rows = zip(*(variant.vertices(side).tolist() for side in sides), strict=True)
+        (folder / "regions" / f"{name}_pairs.txt").write_text("".join(f"{one}, {other}\n" for one, other in rows))
     write_table(folder / "shapes.csv", [["shape"], *([name] for name in SHAPES)])
     table = [["clip", "subject", "sentence", "split", "mood", "voice", "text"]]
     for clip in clips:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from facediff.synthetic.articulation import SIDED, SPEECH_SHAPES, SpeechSound, blend, lip_closure
+from facediff.synthetic.articulation import SIDED, SPEECH_SHAPES, SpeechSound, blend, lip_contact
 from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.head.rig import LOOK_DOWN, LOOK_SIDEWAYS, LOOK_UP, SHAPES
 from facediff.synthetic.prosody import ProsodyContours, blurred
@@ -51,7 +51,7 @@ class SpeakingHabits:
     rounding: float = 1.0
     spreading: float = 1.0
     lips: float = 1.0
-    lead: float = 0.02
+    lead: float = 0.0
     slack: float = 1.0
     smoothness: float = 0.014
     asymmetry: float = 0.0
@@ -116,6 +116,13 @@ _GAIN_OF = {
 }
 
 
+LIP_AT_TEETH = {
+    **{"jawOpen": 0.07, "mouthRollLower": 0.72, "mouthUpperUp": 0.4},
+    **dict.fromkeys(("mouthLowerDown", "mouthFunnel", "mouthPucker", "mouthStretch", "mouthShrugLower"), 0.0),
+}
+"""Weights at which the lower lip lies at the edge of the upper incisors, which are seen."""
+
+
 @dataclass(frozen=True)
 class FaceMotion:
     """The motion of a clip.
@@ -176,10 +183,16 @@ def _mouth(
         # Lips that press, or that touch the teeth, do so in every mood; only large shapes are emphasised.
         gain = effect.articulation * getattr(habits, _GAIN_OF[name]) if name in _GAIN_OF else 1.0
         tracks[name] = smooth(gain * wander * weights[:, column], habits.smoothness)
-    # A speaker with slack articulation shuts the lips in time all the same.
-    shut = smooth(
-        lip_closure(sounds, times + float(np.clip(habits.lead, -0.008, 0.008))), min(habits.smoothness, 0.010)
+    # A speaker with slack articulation touches lips and teeth in time all the same.
+    shut, at_teeth = (
+        smooth(
+            lip_contact(sounds, times + float(np.clip(habits.lead, -0.008, 0.008)), contact),
+            min(habits.smoothness, 0.010),
+        )
+        for contact in ("lip", "teeth")
     )
+    for name, weight in LIP_AT_TEETH.items():
+        tracks[name] = tracks[name] + at_teeth * (weight - tracks[name])
     # Lips that meet show no teeth and are not rounded outwards; the jaw stays where it is and the lips bridge it.
     for name in ("mouthUpperUp", "mouthLowerDown", "mouthRollLower", "mouthFunnel"):
         tracks[name] = tracks[name] * (1.0 - shut)

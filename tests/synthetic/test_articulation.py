@@ -11,7 +11,7 @@ from facediff.synthetic.articulation import (
     SPEECH_SHAPES,
     articulations,
     blend,
-    lip_closure,
+    lip_contact,
     speech_sounds,
 )
 from facediff.synthetic.voices import open_voice
@@ -37,16 +37,17 @@ def test_features_make_the_shapes() -> None:
     assert rounded.targets["mouthPucker"] > 0.8
     assert rounded.targets["mouthStretch"] == 0.0
     for sound in "pbm":
-        assert articulations(sound)[0].closes, sound
-    for sound in "ɸβwfvnt":
-        assert not articulations(sound)[0].closes, sound
-    assert articulations("f")[0].targets["mouthRollLower"] > 0.5
+        assert articulations(sound)[0].contact == "lip", sound
+    for sound in "fvɱ":
+        assert articulations(sound)[0].contact == "teeth", sound
+    for sound in "ɸβwnt":
+        assert not articulations(sound)[0].contact, sound
     assert articulations("") == (PAUSE,)
     assert len(articulations("aɪ")) == 2
     assert len(articulations("tʃ")) == 1
     assert articulations("tʃ")[0].targets["mouthFunnel"] > 0.4
     assert articulations("kʷ")[0].targets["mouthPucker"] > 0.5
-    assert articulations("ˈpʰ")[0].closes
+    assert articulations("ˈpʰ")[0].contact == "lip"
 
 
 @pytest.mark.parametrize("language", SENTENCES)
@@ -54,13 +55,14 @@ def test_every_sound_of_ten_languages_is_known(language: str) -> None:
     utterance = open_voice(f"espeak:{language}").speak(SENTENCES[language])
     unseen = [p.ipa for p in utterance.phonemes if any(part.strength == 0.3 for part in articulations(p.ipa))]
     assert unseen == []
-    closing = [p for p in utterance.phonemes if any(part.closes for part in articulations(p.ipa))]
-    assert len(closing) >= 2
     sounds = speech_sounds(utterance.phonemes)
     times = np.arange(0.0, utterance.phonemes[-1].end, 0.005)
-    closure = lip_closure(sounds, times)
-    for phoneme in closing:
-        assert np.interp(0.5 * (phoneme.start + phoneme.end), times, closure) > 0.95, phoneme
+    for contact, least in (("lip", 2), ("teeth", 0)):
+        touching = [p for p in utterance.phonemes if any(part.contact == contact for part in articulations(p.ipa))]
+        assert len(touching) >= least
+        track = lip_contact(sounds, times, contact)
+        for phoneme in touching:
+            assert np.interp(0.5 * (phoneme.start + phoneme.end), times, track) > 0.95, phoneme
     assert blend(sounds, times)[:, SPEECH_SHAPES.index("jawOpen")].max() > 0.2
 
 

@@ -54,6 +54,11 @@ def lip_pairs(mesh: QuadMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.concatenate([mesh.mirror[upper[:0:-1]], upper]), np.concatenate([mesh.mirror[lower[:0:-1]], lower])
 
 
+def lip_teeth_pairs(mesh: QuadMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The middle of the lower lip and that of the upper incisors' edge, which it touches for f and v."""
+    return mesh.groups["lip_inner"][-1:], mesh.groups["teeth_upper_edge"][:1]
+
+
 def eyelid_pairs(mesh: QuadMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Facing vertices of the lids' edges, (upper, lower), of both eyes without the corners."""
     loop, half = mesh.groups["eye_edge"], EYE_POINTS // 2
@@ -146,7 +151,7 @@ class _Fields:
         }
 
     def _mouth(self) -> dict[str, Array]:
-        mouth = self._hill((0, MOUTH_Y), (22, 15))
+        mouth, drawn = self._hill((0, MOUTH_Y), (22, 15)), self._hill((0, MOUTH_Y), (34, 18))
         upper = self._hill((0, -40), (15, 9)) * (1.0 - self.lower)
         lower = self._hill((0, -53), (15, 9)) * self.lower
         ball, top = self._hill((0, -50), (24, 9)) * self.lower, self._hill((0, -42), (24, 8)) * (1.0 - self.lower)
@@ -156,10 +161,10 @@ class _Fields:
             "mouthFunnel": self._move(
                 -0.20 * self.x * mouth, 4.2 * upper - 4.4 * lower, 5.0 * mouth + 2.0 * (upper + lower)
             ),
-            "mouthPucker": self._move(-0.44 * self.x * mouth, 0.10 * self.off_line * mouth, 8.5 * mouth),
+            "mouthPucker": self._move(-0.40 * self.x * drawn, 0.20 * self.off_line * mouth, 8.5 * mouth),
             "mouthLeft": aside,
             "mouthRight": -aside,
-            "mouthRollLower": self._move(0.0, 4.2 * ball, -6.5 * ball),
+            "mouthRollLower": self._move(0.0, 1.2 * ball, -6.5 * ball),
             "mouthRollUpper": self._move(0.0, -3.2 * top, -5.5 * top),
             "mouthShrugLower": self._move(
                 0.0, 4.5 * self._hill((0, -74), (16, 12)) + 2.0 * lower, 1.5 * self._hill((0, -76), (14, 10)) + lower
