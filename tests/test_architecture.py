@@ -43,7 +43,7 @@ ALLOWED: dict[str, set[str]] = {
     "animation": {"spaces", "mesh", *BASE},
     "data": {"spaces", "speech", "metrics", "mesh", "synthetic", *BASE},
     "editing": {"spaces", "animation", "speech", "metrics", "mesh", "synthetic", *BASE},
-    "models": {"spaces", "version", "animation", "speech", "data", "metrics", "mesh", *BASE},
+    "models": {"spaces", "version", "animation", "speech", "data", "metrics", "evaluation", "mesh", *BASE},
     "callbacks": {"spaces", "version", "models", "speech", "data", "metrics", "mesh", "render", *BASE},
     "export": {"spaces", "animation", "editing", "render", "mesh", *BASE},
     "runtime": {"spaces", "version", "animation", "speech", "export", *BASE},

@@ -179,9 +179,10 @@ class RefereeScores:
             if int(rate.counts[1]):
                 _note(values, f"closures_{name}" if name else "closures", rate)
         if self._mouths:
-            articulated, reference_scores = articulation(self._mouths), articulation(self._true_mouths)
-            found = {"chance": articulated.chance, "closure_auc": articulated.closure_auc}
-            found |= articulated.shares_of(reference_scores)
+            articulated = articulation(self._mouths)
+            found = articulated.shares_of(articulation(self._true_mouths))
+            found = {name: found[name] for name in ("open_vowels", "rounding")}
+            found |= {"chance": articulated.chance, "closure_auc": articulated.closure_auc}
             values |= {name: value for name, value in found.items() if math.isfinite(value)}
         if self._gaps:
             values["gap"] = float(np.mean(self._gaps))

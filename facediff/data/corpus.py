@@ -42,6 +42,8 @@ from facediff.utils.plain_files import read_columns, read_table
 
 LIP_PAIRS, EYELID_PAIRS = "regions/inner_lip_pairs.txt", "regions/eyelid_pairs.txt"
 """Where a corpus lists pairs of an upper and a lower vertex of the inner lips, and of the eyelids."""
+LIP_TEETH_PAIRS = "regions/lip_teeth_pairs.txt"
+"""The same of the lower lip and the upper teeth's edge, which touch for f and v."""
 
 ALL = "all"
 """The region source that stands for every vertex."""

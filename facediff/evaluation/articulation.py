@@ -62,6 +62,7 @@ def mouth_motion(
     millimetres: float,
     frame_rate: float,
     phonemes: Sequence[TimedPhoneme],
+    lip_teeth_pairs: npt.NDArray[np.integer] | None = None,
 ) -> MouthMotion:
     """The mouth of vertices (T, V, 3) of an upright face that looks along z, of (V, 3) at rest.
 
@@ -72,6 +73,7 @@ def mouth_motion(
         millimetres: that a unit of length has.
         frame_rate: frames a second.
         phonemes: of the speech.
+        lip_teeth_pairs: (P, 2) of the lower lip and the upper teeth's edge, of faces that have teeth.
     """
     upper = np.asarray(lip_pairs)[:, 0]
     sideways = template[upper, 0]
@@ -81,7 +83,10 @@ def mouth_motion(
         moving, resting = (np.asarray(pair_distances(faces, pairs), np.float64) for faces in (vertices, template[None]))
         return millimetres * (moving - resting)
 
-    return MouthMotion(beyond_rest(lip_pairs), beyond_rest(corners), frame_rate, phonemes)
+    contact = None
+    if lip_teeth_pairs is not None:
+        contact = millimetres * np.asarray(pair_distances(vertices, lip_teeth_pairs), np.float64)
+    return MouthMotion(beyond_rest(lip_pairs), beyond_rest(corners), frame_rate, phonemes, contact)
 
 
 @dataclass(frozen=True)
@@ -107,8 +112,9 @@ class ArticulationScores:
     contact: float = math.nan
 
     def shares_of(self, truth: ArticulationScores) -> dict[str, float]:
-        """Opening and rounding as shares of the truth's."""
-        return {name: getattr(self, name) / getattr(truth, name) for name in ("open_vowels", "rounding")}
+        """Every score as a share of the truth's; NaN where that is 0."""
+        pairs = zip(fields(self), astuple(self), astuple(truth), strict=True)
+        return {each.name: value / true if true else math.nan for each, value, true in pairs}
 
 
 def articulation(recordings: Sequence[MouthMotion]) -> ArticulationScores:

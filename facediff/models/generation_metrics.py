@@ -21,8 +21,10 @@ from torchmetrics import Metric
 
 from facediff.data import Batch, Clip, Sample, SpeechMotionDataModule, collate
 from facediff.data.batch import UNKNOWN_IDENTITY
+from facediff.data.corpus import LIP_TEETH_PAIRS
 from facediff.data.dataset import MotionDataset
 from facediff.errors import FaceDiffError, counted, damaged
+from facediff.evaluation.articulation import MouthMotion, articulation, mouth_motion
 from facediff.metrics import (
     MeanVertexError,
     MotionLiveliness,
@@ -37,6 +39,8 @@ from facediff.models.evaluation import with_identity
 from facediff.models.inference import named
 from facediff.models.scoring import ScoredCorpus
 from facediff.registry import name_of
+from facediff.spaces.space import METRES
+from facediff.speech.phonemes import phonemes_file, read_phonemes
 from facediff.utils import ranges
 from facediff.utils.ranges import Range
 
@@ -84,7 +88,12 @@ GENERATION_METRICS: dict[str, str] = {
     "mve": "MVE, one sample",
     "energy_lips": "energy score of the lips",
     "energy_upper_face": "energy score of the upper face",
-    "closures": "closures at p, b, m / truth's (1)",
+    "closure_auc": "lips nearer at p, b, m than at other sounds, AUC / truth's (1)",
+    "closed": "lips within 1 mm at p, b, m / truth's (1)",
+    "chance": "the same at other sounds / truth's (1)",
+    "open_vowels": "opening of open vowels / truth's (1)",
+    "rounding": "narrowing at u, o, w / truth's (1)",
+    "contact": "lower lip at the teeth for f, v / truth's (1)",
     "nearest_speaker": "nearest speaker is right, identity hidden (1; chance {chance})",
     "true_nearest_speaker": "nearest speaker is right, truth",
     **{
@@ -120,8 +129,6 @@ OF_EACH = {
     "blinks_a_minute": "blink_rate",
     "true_blinks_a_minute": "blink_rate:of=truth",
     "eyelid_drift": "eyelid_drift",
-    "closed": "bilabial_closure_rate",
-    "truly_closed": "bilabial_closure_rate:of=truth",
 }
 """Metrics of each sample by itself, by name."""
 
@@ -151,7 +158,7 @@ OF_BASELINES = {
 }
 """Metrics of two faces that do not move, and of the truth itself."""
 
-NEEDED = {"nearest_speaker": ("gallery",), "blink_ratio": ("lid_pairs",), "closures": ("closures", "lip_pairs")}
+NEEDED = {"nearest_speaker": ("gallery",), "blink_ratio": ("lid_pairs",), "closed": ("closures", "lip_pairs")}
 """Metrics for which a corpus may have no files, and the files."""
 
 
@@ -191,6 +198,7 @@ class EvaluationCorpus(ScoredCorpus):
         super().__init__(data, assets, speakers)
         tables = (OF_EACH, OF_SAMPLES, *OF_BASELINES.values(), OF_OWN_REFERENCE)
         self.needs = {need for table in tables for text in table.values() for need in parse(text).needs}
+        self.teeth = None if data.mesh_corpus is None else data.mesh_corpus.read_pairs(LIP_TEETH_PAIRS)
         context = self.context(self.needs, torch.device("cpu"))
         # Of a model without noise all samples are one.
         self.offered = replace(context, has={**context.has, "samples": {}})
@@ -206,6 +214,22 @@ class EvaluationCorpus(ScoredCorpus):
             for name, request in requests.items()
             if set(request.needs) <= self.offered.has.keys()
         }
+
+    def mouth(self, clip: Clip, offsets: Tensor) -> MouthMotion | None:
+        """The mouth of a motion (frames, V, 3) of a clip; None where lips, lengths or phonemes are not known."""
+        scored, file = self.assets.scored, phonemes_file(self.data.root, clip.name)
+        if file is None or scored.inner_lip_pairs is None or scored.unit not in METRES:
+            return None
+        rest = scored.template(clip.identity).cpu().numpy()
+        return mouth_motion(
+            offsets.cpu().numpy() + rest,
+            rest,
+            scored.inner_lip_pairs.cpu().numpy(),
+            millimetres=1000 * METRES[scored.unit],
+            frame_rate=scored.frame_rate,
+            phonemes=read_phonemes(file),
+            lip_teeth_pairs=None if self.teeth is None else self.teeth.numpy(),
+        )
 
     def references(self, clip: Clip, template: str) -> dict[str, Clip]:
         """A clip's references by their owner; ``template`` is the name of the usual one."""
@@ -268,6 +292,7 @@ class Measurement:
             for group in ("channels", "channel_samples"):
                 self.metrics[group] = {name: metric.to(device) for name, metric in self.metrics[group].items()}
         self.speed = RealTimeFactor(device_name(device))
+        self.mouths: list[tuple[MouthMotion, MouthMotion]] = []
 
     def _update(self, group: str, inputs: Mapping[str, Any]) -> None:
         for metric in self.metrics.get(group, {}).values():
@@ -285,6 +310,9 @@ class Measurement:
             self._update(every, {**inputs, "samples": motion.expand(-1, self.compared, -1, -1, -1)})
             for one_sample in motion.unbind(1):
                 self._update(key, {**inputs, "prediction": one_sample})
+        mouths = corpus.mouth(clip, motion[0, 0]), corpus.mouth(clip, truth[0])
+        if mouths[0] and mouths[1]:
+            self.mouths.append((mouths[0], mouths[1]))
         mean = corpus.decoded(corpus.mean_faces.of([clip.identity]).to(batch.motion)[:, None], [clip.identity])
         faces = {"still": torch.zeros_like(truth), "mean_face": mean.expand_as(truth), "truth": truth}
         for face, motion in faces.items():
@@ -353,6 +381,10 @@ class Measurement:
                 with suppress(ValueError):  # no value on any sequence
                     raw[name] = float(metric.compute())
 
+        if self.mouths:
+            made, true = (articulation(mouths) for mouths in zip(*self.mouths, strict=True))
+            raw |= {name: value for name, value in made.shares_of(true).items() if math.isfinite(value)}
+
         def ratio(above: str, below: str) -> float | None:
             numerator, denominator = raw.get(above), raw.get(below)
             return None if numerator is None or not denominator else numerator / denominator
@@ -361,7 +393,6 @@ class Measurement:
             **raw,
             "fdd_still": ratio("fdd", "still_fdd"),
             "fdd_signed_still": ratio("fdd_signed", "still_fdd_signed"),
-            "closures": ratio("closed", "truly_closed"),
             **{
                 f"{name}_{face}": ratio(name, f"{face}_lve")
                 for name in ("lve", "lve_mean", "lve_best")

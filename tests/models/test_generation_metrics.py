@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -15,10 +16,13 @@ import facediff.metrics as fm
 from facediff.cli.generation_metrics import text
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
+from facediff.evaluation.articulation import MouthMotion, articulation, mouth_motion
 from facediff.models.base import AnimationModel
 from facediff.models.generation_metrics import GENERATION_METRICS, GenerationScores, SamplingOptions, means_of, measure
+from facediff.speech.phonemes import TimedPhoneme
+from facediff.utils.plain_files import write_table
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
-from tests.fakes.tiny import RATE, SEEN, VERTICES, Tiny
+from tests.fakes.tiny import RATE, SEEN, VERTICES, Tiny, write_tiny
 
 LIPS, UPPER = range(12), range(12, 24)
 Make = Callable[..., Any]
@@ -115,8 +119,32 @@ def test_every_generation_metric_is_the_metric_that_it_names(tiny: Tiny) -> None
         assert scores.mean("test_a", name) == pytest.approx(value, rel=1e-5), name
     assert scores.mean("test_a", "real_time_factor") > 0  # type: ignore[operator]
     assert scores.clips == {"test_a": 4}
-    assert {"blink_ratio", "closures"} <= scores.missing.keys()
+    assert {"blink_ratio", "closed"} <= scores.missing.keys()
     assert scores.mean("test_a", "blink_ratio") is None
+
+
+def test_a_mumbling_mouth_has_its_share_of_the_truths_articulation(tmp_path: Path) -> None:
+    data = Tiny(root=str(write_tiny(tmp_path / "tiny")))
+    for file, pairs in (("inner_lip_pairs", "0, 12\n1, 13\n"), ("lip_teeth_pairs", "2, 14\n")):
+        (data.root / "regions" / f"{file}.txt").write_text(pairs)
+    (data.root / "phonemes").mkdir()
+    said = [("0", "0.12", "p"), ("0.12", "0.24", "a"), ("0.24", "0.36", "f"), ("0.36", "0.48", "u")]
+    for clip in data.clips("test_a"):
+        write_table(data.root / "phonemes" / f"{clip.name}.csv", [("start", "end", "ipa"), *said])
+    scores = run(data, scripted(data, lambda batch, _: batch.motion / 2), splits=["test_a"])
+    faces: dict[float, list[MouthMotion]] = {1.0: [], 0.5: []}
+    for sample in data.dataset("test_a"):
+        rest, spoken = sample.template.numpy(), [TimedPhoneme(float(a), float(b), ipa) for a, b, ipa in said]
+        for share, mouths in faces.items():
+            vertices = rest + share * sample.motion.numpy()
+            facts = {"millimetres": 1000, "frame_rate": RATE, "phonemes": spoken}
+            pairs = np.array([[0, 12], [1, 13]]), np.array([[2, 14]])
+            mouths.append(mouth_motion(vertices, rest, pairs[0], lip_teeth_pairs=pairs[1], **facts))
+    shares = articulation(faces[0.5]).shares_of(articulation(faces[1.0]))
+    for name in ("closure_auc", "closed", "chance", "open_vowels", "rounding", "contact"):
+        expected = None if np.isnan(shares[name]) else pytest.approx(shares[name], rel=1e-5)
+        assert scores.mean("test_a", name) == expected, name
+    assert scores.mean("test_a", "open_vowels") is not None
 
 
 def test_a_reference_is_followed_with_the_label_and_without(tiny: Tiny) -> None:
