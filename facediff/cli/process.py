@@ -34,10 +34,11 @@ LONG, LARGE = 3600.0, 8 * 2**30
 
 LOST_PROCESS = re.compile(
     r"(gloo|NCCL|ProcessGroup|TCPStore|store).*"
-    r"(onnection (closed|reset|refused)|roken pipe|imed? ?out|remote process exited|recvValue|sendBytes)",
+    r"(onnection (closed|reset|refused)|roken pipe|imed? ?out|remote process exited|recvValue|sendBytes)"
+    r"|DataLoader worker .*(killed|exited)",
     re.IGNORECASE,
 )
-"""What PyTorch says where another process of a distributed run has gone."""
+"""What PyTorch says where another process of a distributed run, or one that reads data, has gone."""
 
 
 class StandardOutputError(FaceDiffError):
@@ -199,8 +200,8 @@ def report(error: BaseException) -> int:
         return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
     if isinstance(error, RuntimeError) and LOST_PROCESS.search(text):
         return fail(
-            f"another process of the run ended, or cannot be reached; see its own message, and continue a training "
-            f"with --ckpt_path last ({more})"
+            f"another process of the run ended, or cannot be reached: {text[:100]}; see its own message, or whether "
+            f"memory ran out, and continue a training with --ckpt_path last ({more})"
         )
     refusal = next((cause for cause in chain(error) if _refuses(cause)), None)
     if refusal is not None:

@@ -117,6 +117,7 @@ class CudaError(RuntimeError):
             RuntimeError("NCCL communicator was aborted on rank 1: remote process exited or network error"),
             2,
         ),
+        (RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "), 2),
         (RuntimeError("[Rank 0] Watchdog caught collective operation timeout: ProcessGroupNCCL timed out"), 2),
         (RecursionError("maximum recursion depth exceeded"), 2),
         (PermissionError(13, "Permission denied", "secret.npz"), 2),
