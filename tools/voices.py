@@ -9,7 +9,7 @@ noise and hum by filters in time. The truth stays what it was, so that scores ca
   share with the closures moved to every other time of the clip. *Within 1 mm* and *gap*: how far the lips' pairs are
   apart at their nearest in a closure, compared with the neutral face, in mm.
 - *kept out*: the clips of test C, whose voices nobody is trained with, by voice.
-- *people kept out*: articulation (facediff/evaluation/articulation.py) in sentences of test and validation by voices of
+- *people kept out*: articulation (facediff/data/articulation.py) in sentences of test and validation by voices of
   people that nobody is trained with, where installed; means over sentences, and half of the AUC's 95 % interval.
 - *recordings*: the same of people's own, in a folder of `facediff data align` (``--recordings FOLDER``); means over
   speakers.
@@ -43,8 +43,9 @@ import facediff
 from facediff.animation.options import GROUPS
 from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
+from facediff.data.articulation import MouthMotion, mouth_motion
 from facediff.data.track.face import pair_distances
-from facediff.evaluation.articulation import MouthMotion, by_speaker, mouth_motion
+from facediff.evaluation.articulation import by_speaker
 from facediff.speech.audio import fit_length
 from facediff.speech.espeak import Utterance
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes

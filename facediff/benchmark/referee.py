@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from facediff.evaluation.articulation import MouthMotion, articulation, mouth_motion
+from facediff.data.articulation import MouthMotion, articulation, mouth_motion
 from facediff.metrics import (
     BilabialClosureRate,
     BlinkRate,

@@ -20,11 +20,11 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from facediff.data import Batch, Clip, Sample, SpeechMotionDataModule, collate
+from facediff.data.articulation import MouthMotion, articulation, mouth_motion
 from facediff.data.batch import UNKNOWN_IDENTITY
 from facediff.data.corpus import LIP_TEETH_PAIRS
 from facediff.data.dataset import MotionDataset
 from facediff.errors import FaceDiffError, counted, damaged
-from facediff.evaluation.articulation import MouthMotion, articulation, mouth_motion
 from facediff.metrics import (
     MeanVertexError,
     MotionLiveliness,

@@ -15,8 +15,8 @@ from torch import Tensor
 import facediff.metrics as fm
 from facediff.cli.generation_metrics import text
 from facediff.data import Batch, collate
+from facediff.data.articulation import MouthMotion, articulation, mouth_motion
 from facediff.errors import FaceDiffError
-from facediff.evaluation.articulation import MouthMotion, articulation, mouth_motion
 from facediff.models.base import AnimationModel
 from facediff.models.generation_metrics import GENERATION_METRICS, GenerationScores, SamplingOptions, means_of, measure
 from facediff.speech.phonemes import TimedPhoneme
