@@ -10,11 +10,9 @@ fine-tuning of zero-shot models"). Recordings of people with their words teach i
 there the teacher hears the corpus's own synthesiser say the same words (:mod:`facediff.models.transcribed`).
 
 **Low latency.** The student gets truncated speech, which ends a moment after a frame, and must reproduce the teacher's
-features of the whole recording. A model with windows that reach beyond the received speech animates silence there, from
-which a trained model concludes that the speech is over, and begins to close the mouth: of that silence, the student
-must predict the teacher's features as far as possible. Some pieces stay whole, so that recordings sound as before.
-The student may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean 2015, "Distilling the
-knowledge in a neural network"): HuBERT takes a fifth of a second for each frame of a stream.
+features of the whole recording up to that end. Some pieces stay whole, so that recordings sound as before. The student
+may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean 2015, "Distilling the knowledge in a neural
+network"): HuBERT takes a fifth of a second for each frame of a stream.
 """
 
 from __future__ import annotations
@@ -358,8 +356,7 @@ class SpeechPairs(Dataset[DistillationBatch]):
         # More than half a second before the frame, steps have enough context already, and would drown the error of the
         # hard ones. Where nothing is animated ahead, those within the look-ahead are context only.
         frame = end - after - start
-        last = min(steps, end + silent) - start if ahead else frame
-        compared = (max(0, frame - STEP_RATE // 2), last)
+        compared = (max(0, frame - STEP_RATE // 2), end - start if ahead else frame)
         return Piece(piece, np.arange(start, end + silent), compared, mean, deviation)
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:

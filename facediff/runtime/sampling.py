@@ -107,15 +107,14 @@ def window_motion(
     Returns:
         the motion, and the tail that the next window blends with.
     """
-    own_frames = slice(window.context, window.context + window.frames + window.plan.ahead)
     if model.description.blending == "motion":
-        motion = clip_motion(model, speech, conditions)[:, own_frames][:, window.fixed : window.frames]
+        motion = clip_motion(model, speech, conditions)[:, window.encoded][:, window.fixed : window.frames]
         if before is not None:
             shared = before[0].shape[1]
             blended = before[0] + crossfade(shared, 0)[:, None, None] * (motion[:, :shared] - before[0])
             motion = np.concatenate([blended, motion[:, shared:]], 1)
         return motion, [motion[:, max(0, motion.shape[1] - window.plan.overlap) :]]
-    features = np.ascontiguousarray(features_of(model, speech, speech.frames)[:, own_frames])
+    features = np.take(features_of(model, speech, speech.frames), window.encoded, axis=1)
     new, last = slice(window.fixed, window.frames), slice(max(0, window.frames - window.kept), window.frames)
     sampling = SamplerRun(model, conditions, before, window.shared, new)
     noise = NumpyWindowNoise(NAME, window, [conditions.choices.seed])

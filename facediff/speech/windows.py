@@ -123,7 +123,7 @@ class WindowPlan:
             in one pass.
         past: motion before the window that it sees and continues.
         ahead: motion after the window that is generated with it and not given out. Its noise is known before its
-            speech, which is replaced by silence where it is not heard yet.
+            speech; where that is not heard yet, the speech is taken to stay as it was last.
 
     Example:
         >>> plan = WindowPlan(seconds=2.0, overlap=0.5)
@@ -266,6 +266,13 @@ class MotionWindow:
     def context(self) -> int:
         """Frames before the window: the model receives their speech, but does not animate them."""
         return min(self.plan.before, self.start)
+
+    @property
+    def encoded(self) -> npt.NDArray[np.int64]:
+        """Of which frame of the encoded speech each of its frames, and of those ahead, has the features."""
+        # Silence after them would be taken for the end of the speech: the mouth would open a third too wide at onsets.
+        heard = self.frames + self.plan.after
+        return self.context + np.minimum(np.arange(self.frames + self.plan.ahead), heard - 1)
 
     @property
     def shared(self) -> int:

@@ -78,6 +78,17 @@ def test_windows_with_a_past_share_its_noise(plan: WindowPlan) -> None:
     assert float((every @ every.T / 32 - torch.eye(len(every))).abs().max()) < 6.5 * (2 / 32) ** 0.5
 
 
+@pytest.mark.parametrize("plan", [*PLANS, LOW_LATENCY, LOW_LATENCY_AHEAD, WindowPlan()])
+def test_speech_ahead_stays_as_it_is_heard_last(plan: WindowPlan) -> None:
+    frames = plan.in_frames(25.0)
+    for index in range(40):
+        window = frames.window(index)
+        places = window.start - window.context + window.encoded  # in the recording
+        heard = min(window.end + frames.after, window.end + frames.ahead)
+        assert places[: heard - window.start].tolist() == [*range(window.start, heard)]
+        assert places[heard - window.start :].tolist() == [heard - 1] * (window.end + frames.ahead - heard)
+
+
 @pytest.fixture(params=["frames by themselves", "prior over time"])
 def model(ready: Callable[..., DualPathDiffusion], tiny: Tiny, request: pytest.FixtureRequest) -> DualPathDiffusion:
     if request.param == "frames by themselves":

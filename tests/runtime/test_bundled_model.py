@@ -14,7 +14,9 @@ import facediff
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.runtime.folder import read_folder
+from facediff.speech.audio import read_speech
 from facediff.synthetic.cast import SEEN, UNSEEN
+from facediff.synthetic.known_faces import built_in_rig
 from facediff.utils import hub
 
 ROOT = Path(__file__).parents[2]
@@ -52,6 +54,24 @@ def test_the_face_lives_in_what_is_looked_at_and_not_in_numbers(
     assert np.array_equal(facediff.read(tmp_path / "plain.npz").vertices, motion.vertices)
     assert main(["animate", str(SPEECH), "-o", str(tmp_path / "x.npz"), "--still"]) == 2
     assert "is for videos, pages and avatars" in capsys.readouterr().err
+
+
+def test_a_stream_opens_the_mouth_no_wider_than_the_recording_does() -> None:
+    """On the first sound, of which it hears no more than the beginning."""
+    model = facediff.load()
+    rig = built_in_rig("F1")
+    jaw = rig.deltas[rig.names.index("jawOpen")]
+    start = read_speech(SPEECH)[:12_800]  # until the first pause
+    recording: list[float] = []
+    stream: list[float] = []
+    for seed in range(4):
+        motion = model.animate(SPEECH, seed=seed)
+        for peaks, vertices in (
+            (recording, motion.vertices),
+            (stream, model.animate(start, 16_000, seed=seed, low_latency=True).vertices),
+        ):
+            peaks.append(float(((vertices - motion.template) * jaw).sum(axis=(1, 2)).max() / (jaw**2).sum()))
+    assert np.mean(stream) < 1.2 * np.mean(recording)
 
 
 def test_its_name_is_taken_unless_a_file_is_called_so(

@@ -64,9 +64,9 @@ class Conditions:
     shares: tuple[float, ...] = (1.0,)
     dynamic: Float[Tensor, "batch dynamic_dim"] | None = None
 
-    def frames(self, start: int, end: int) -> Conditions:
+    def frames(self, places: Int[Tensor, " animated"]) -> Conditions:
         """The conditions of some of the frames, with nothing prepared."""
-        return Conditions(self.audio[:, start:end], self.style, self.mask[:, start:end], shares=self.shares)
+        return Conditions(self.audio[:, places], self.style, self.mask[:, places], shares=self.shares)
 
     def for_draws(self, times: int) -> Conditions:
         """The conditions of several noisy versions of every clip, clip by clip."""
@@ -196,7 +196,7 @@ class ConditionEncoding(nn.Module):
         identity: Int[Tensor, " batch"],
         style: Float[Tensor, "batch style_dim"],
         hidden: Hidden = Hidden(),  # noqa: B008 - it cannot be changed
-        animated: slice = slice(None),
+        animated: slice | Tensor = slice(None),
     ) -> Conditions:
         """Everything that is computed once per clip.
 
@@ -300,7 +300,7 @@ class ConditionedModel(AnimationModel):
         shares = {tuple(names[k:]): scales[k] - scales[k + 1] for k in range(len(names) + 1)}
         return {hidden: share for hidden, share in shares.items() if share}
 
-    def conditions(self, batch: Batch, *, guided: bool = False, animated: slice = slice(None)) -> Conditions:
+    def conditions(self, batch: Batch, *, guided: bool = False, animated: slice | Tensor = slice(None)) -> Conditions:
         """Everything that is computed once per clip; in training, conditions are hidden now and then.
 
         Args:

@@ -60,8 +60,8 @@ class Generation(DualPathRecipe):
     ) -> tuple[Float[Tensor, "samples frames points dims"], list[Tensor]]:
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.
-        animated = slice(window.context, window.context + window.frames + window.plan.ahead)
-        conditions = self.conditions(clip, guided=True, animated=animated).frames(animated.start, animated.stop)
+        animated = torch.from_numpy(window.encoded).to(self.device)
+        conditions = self.conditions(clip, guided=True, animated=animated).frames(animated)
         overlap = WindowOverlap(before, slice(max(0, window.frames - window.kept), window.frames), window.fixed)
         unit = WindowNoise(clip.names[0], window, seeds, self.device)
         unit_of_mean = WindowNoise(mean_names(clip)[0], window, [0], self.device)

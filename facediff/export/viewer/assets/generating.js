@@ -43,8 +43,12 @@ async function windowMotion(model, heard, window, conditions, before, check) {
   }
   const { data, shape } = await model.features(heard, heard.frames);
   const width = data.length / heard.frames;
-  const count = frames + window.plan.ahead;
+  const count = frames + window.plan.ahead, latest = frames + window.plan.after - 1;
   const features = { data: data.slice(context * width, (context + count) * width), shape: [1, count, ...shape.slice(2)] };
+  // Speech that is not heard yet is taken to stay as it is heard last.
+  for (let frame = latest + 1; frame < count; frame++) {
+    features.data.copyWithin(frame * width, latest * width, (latest + 1) * width);
+  }
   const sampling = new Sampling(model, conditions, features, before, window, check);
   const noise = new WindowNoise(CLIP_NAME, window, conditions.seed);
   const motion = await sampling.run(noise, new WindowNoise(`${CLIP_NAME}/mean`, window, 0));
