@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -82,25 +83,26 @@ def test_threads_write_what_is_written_without_the_option(place: Path, capsys: p
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_cluster_of_other_processes_writes_the_same(place: Path, checkpoint: Path) -> None:
+def test_a_cluster_of_other_processes_writes_the_same(
+    place: Path, checkpoint: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With one of its two workers killed between the commands."""
-    pytest.importorskip("distributed")
-    from tests.fakes.dask_processes import DaskProcesses
-
+    distributed = pytest.importorskip("distributed")
     animate = ["animate", "speech", "--checkpoint", str(checkpoint), "--suffix", ".npz", "--quiet", "-o"]
-    with DaskProcesses(place / "cluster") as cluster:
+    monkeypatch.chdir(tmp_path_factory.mktemp("cluster"))
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         printed = {}
-        for out, where in (("here", "processes"), ("there", cluster.address)):
+        for out, where in (("here", "processes"), ("there", cluster.scheduler_address)):
             printed[out] = ""
             for words in [*commands(out), [*animate, f"{out}/motion"]]:
                 environment = {**os.environ, "PYTHONPATH": str(ROOT)}
                 command = [sys.executable, "-m", "facediff", *words, "--scheduler", where, "--workers", "2"]
-                done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=250)
+                done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=250)
                 assert done.returncode == 0, done.stderr
                 if "animate" not in words:  # which prints seconds
                     printed[out] += done.stdout.replace(out, "")
                 if out == "there" and "evaluate" in words:
-                    cluster.kill(cluster.programs[-1])
+                    os.kill(cluster.workers[1].pid, signal.SIGKILL)
     assert written(place / "here") == written(place / "there")
     assert len(list((place / "there" / "motion").glob("*.npz"))) == 2
     assert printed["here"] == printed["there"]

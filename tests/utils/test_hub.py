@@ -1,15 +1,15 @@
-"""Models on the hub: sent to a fake one on the loopback, fetched from it, and found again without network."""
+"""Models on the hub: sent there, fetched from it, and told from paths of this machine."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
+import shutil
 from pathlib import Path
+from unittest.mock import Mock, create_autospec
 
+import huggingface_hub
 import pytest
+from huggingface_hub.errors import HfHubHTTPError
+from huggingface_hub.utils.tqdm import are_progress_bars_disabled
 
 from facediff.errors import FaceDiffError
 from facediff.utils.hub import (
@@ -18,50 +18,42 @@ from facediff.utils.hub import (
     CONFIG,
     WEIGHTS,
     check_model_source,
+    fetch,
     hub_id,
     model_files,
     model_hash,
     model_name,
+    push,
 )
-from tests.fakes.hub import FakeHub, Repository, fake_hub
 
-TRY = """
-import json, os, sys
-from pathlib import Path
-from facediff.errors import FaceDiffError
-from facediff.utils import hub
-for function, *words in json.loads(sys.argv[1]):
-    try:
-        found = hub.push(Path(words[0]), words[1]) if function == "push" else hub.fetch(*words)
-        print(json.dumps(["done", str(found)]))
-    except FaceDiffError as error:
-        print(json.dumps(["error", str(error)]))
-"""
 CARD_TEXT = b"---\nlicense: mit\n---\n# A face\n"
 
 
-def attempts(hub_address: str, home: Path, *calls: list[str], **environment: str) -> list[list[str]]:
-    """What comes of calls in a process of their own, since the hub's library reads its environment when imported."""
-    settings = {
-        "HF_ENDPOINT": hub_address, "HF_HOME": str(home), "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_TELEMETRY": "1",
-        "HF_HUB_ETAG_TIMEOUT": "2",
-    }  # fmt: skip
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
-    done = subprocess.run(
-        [sys.executable, "-c", TRY, json.dumps(calls)],
-        env={**kept, **settings, **environment},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    return [json.loads(line) for line in done.stdout.splitlines()]
-
-
 @pytest.fixture
-def hub() -> Iterator[FakeHub]:
-    with fake_hub() as found:
-        yield found
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of models by name and revision behind the library's functions, with the parameters that they have."""
+    root = tmp_path / "hub"
+
+    def upload(repo_id: str, folder_path: Path, commit_message: str, allow_patterns: list[str]) -> None:
+        made = shutil.copytree(folder_path, root / repo_id / "main")
+        for path in made.iterdir():
+            if path.name not in allow_patterns:
+                path.unlink()
+
+    def download(name: str, revision: str | None, allow_patterns: list[str], library_name: str) -> str:
+        assert are_progress_bars_disabled()
+        if not (root / name / (revision or "main")).is_dir():
+            raise HfHubHTTPError(f"404 Client Error.\n\nRevision Not Found for {name}", response=Mock())
+        assert set(allow_patterns) == {CONFIG, WEIGHTS, ASSETS, CARD}
+        return str(root / name / (revision or "main"))
+
+    api = create_autospec(huggingface_hub.HfApi)
+    api.return_value.create_repo.side_effect = lambda name, private, exist_ok: f"https://hub/{name} {private}"
+    api.return_value.upload_folder.side_effect = upload
+    monkeypatch.setattr(huggingface_hub, "HfApi", api)
+    library = create_autospec(huggingface_hub.snapshot_download, side_effect=download)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", library)
+    return root
 
 
 @pytest.fixture
@@ -74,56 +66,21 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
-def test_a_model_goes_to_the_hub_and_comes_back_and_stays(hub: FakeHub, folder: Path, tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    sent, fetched, absent, unknown = attempts(
-        hub.address,
-        home,
-        ["push", str(folder), "ada/face"],
-        ["fetch", "ada/face"],
-        ["fetch", "ada/face", "v9"],
-        ["fetch", "bob/nothing"],
-        HF_TOKEN=hub.token,
-    )
-    assert sent == ["done", f"{hub.address}/ada/face"]
-    assert hub.models["ada/face"].commits[-1][1].keys() == {".gitattributes", CONFIG, WEIGHTS, ASSETS, CARD}
-    assert hub.cards == [CARD_TEXT.decode()]
-    assert fetched[0] == "done"
-    for name in (CONFIG, WEIGHTS, ASSETS, CARD):
-        assert (Path(fetched[1]) / name).read_bytes() == (folder / name).read_bytes()
-    assert absent[0] == unknown[0] == "error"
-    assert "ada/face@v9" in absent[1]
-    assert "revision" in absent[1]
-    assert "bob/nothing" in unknown[1]
-    # The cache has it where nobody answers, and where nobody may be asked.
-    asked = len(hub.asked)
-    offline = attempts(hub.address, home, ["fetch", "ada/face"], ["fetch", "eva/face"], HF_HUB_OFFLINE="1")
-    assert len(hub.asked) == asked
-    assert offline[0] == fetched
-    assert offline[1][0] == "error"
-    assert "HF_HUB_OFFLINE" in offline[1][1]
-    nobody = attempts("http://127.0.0.1:9", home, ["fetch", "ada/face"], ["fetch", "eva/face"])
-    assert nobody[0] == fetched
-    assert nobody[1][0] == "error"
-
-
-def test_what_the_hub_refuses_is_said_with_the_models_name(hub: FakeHub, folder: Path, tmp_path: Path) -> None:
-    hub.models["ada/other"] = Repository()
-    hub.models["ada/other"].commit({"pytorch_model.bin": b"x"})
-    hub.models["ada/gated"] = Repository(gated=True)
-    hub.models["ada/gated"].commit({CONFIG: b"{}"})
-    other, gated, sent = attempts(
-        hub.address,
-        tmp_path / "home",
-        ["fetch", "ada/other"],
-        ["fetch", "ada/gated"],
-        ["push", str(folder), "ada/face"],
-        HF_TOKEN="hf_wrong",  # noqa: S106 - no account
-    )
-    for (status, text), words in ((other, ["ada/other", CONFIG]), (gated, ["ada/gated"]), (sent, ["ada/face"])):
-        assert status == "error"
-        assert all(word in text for word in [*words]), text
-        assert "\n" not in text
+def test_a_model_goes_to_the_hub_and_comes_back(hub: Path, folder: Path) -> None:
+    assert push(folder, "ada/face", private=True) == "https://hub/ada/face True"
+    fetched = fetch("ada/face")
+    assert {path.name for path in fetched.iterdir()} == {CONFIG, WEIGHTS, ASSETS, CARD}
+    assert not are_progress_bars_disabled()
+    shutil.copytree(fetched, hub / "ada/face/v1").joinpath(CONFIG).unlink()
+    with pytest.raises(FaceDiffError, match=rf"ada/face@v1: .* no {CONFIG}, so"):
+        fetch("ada/face", "v1")
+    for call, name in (
+        (lambda: fetch("ada/face", "v9"), "ada/face@v9"),
+        (lambda: push(folder, "ada/face"), "ada/face"),
+    ):
+        with pytest.raises(FaceDiffError, match=f"^{name}: .*can it be") as refused:
+            call()
+        assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
