@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
-import yaml
 
 from facediff.cli.app import main
 from facediff.cli.configs import check_config
@@ -15,6 +13,7 @@ from facediff.cli.lightning import find_config
 from facediff.errors import FaceDiffError
 from facediff.utils.files import config_dir
 from facediff.utils.yaml_files import load_yaml
+from tests.fakes.parsing import printed_config
 
 BAD: dict[str, bytes] = {
     "not utf-8": b"model: \xff\xfe\xe4\n",
@@ -76,35 +75,25 @@ def test_plain_yaml_holds_numbers_and_texts_and_no_objects(tmp_path: Path) -> No
             load_yaml(path, "expected a plan")
 
 
-def printed_config(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
-    with pytest.raises(SystemExit, match="0"):
-        main(["fit", *words, "--print_config"])
-    return dict(yaml.safe_load(capsys.readouterr().out))
-
-
-def test_bundled_parts_are_named_inside_ones_own_config(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bundled_parts_are_named_inside_ones_own_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From any folder; a file of the user's own at the same place comes first."""
     (tmp_path / "mine.yaml").write_text(
         "model: configs/model/voca_small.yaml\ndata: configs/data/puppet.yaml\n"
         "trainer: configs/trainer/published_cpu.yaml\n"
     )
     monkeypatch.chdir(tmp_path)
-    config = printed_config(capsys, "--config", "mine.yaml")
+    config = printed_config("--config", "mine.yaml")
     assert config["trainer"]["max_epochs"] == 30
     assert config["model"]["class_path"].endswith("Voca")
     (tmp_path / "configs" / "trainer").mkdir(parents=True)
     (tmp_path / "configs" / "trainer" / "published_cpu.yaml").write_text("max_epochs: 7\n")
-    assert printed_config(capsys, "--config", "mine.yaml")["trainer"]["max_epochs"] == 7
+    assert printed_config("--config", "mine.yaml")["trainer"]["max_epochs"] == 7
 
 
 @pytest.mark.parametrize("name", ["configs/trainer/cpu.yaml", "trainer/cpu"])
-def test_a_bundled_part_is_given_as_a_config(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bundled_part_is_given_as_a_config(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    config = printed_config(capsys, "--config", name, "--model=Voca", "--data=Puppet")
+    config = printed_config("--config", name, "--model=Voca", "--data=Puppet")
     assert config["trainer"]["logger"]["init_args"]["save_dir"] == "runs"
 
 

@@ -28,6 +28,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from tests.cli.conftest import SMALL
 from tests.fakes import processes, tiny
+from tests.fakes.parsing import printed_config
 
 Fit = Callable[..., int]
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -206,21 +207,12 @@ def test_help_of_a_component(capsys: pytest.CaptureFixture[str]) -> None:
     assert "style_dim" not in text
 
 
-def print_config(*words: str, capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", *words, "--print_config"])
-    assert stop.value.code == 0
-    return yaml.safe_load(capsys.readouterr().out)
-
-
 @pytest.mark.parametrize(
     "words", [["--model.sampler=ddpm", "--model.decoder=gru"], ["--model.sampler", "ddpm", "--model.decoder", "gru"]]
 )
-def test_a_component_chosen_by_name_starts_from_its_own_defaults(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_component_chosen_by_name_starts_from_its_own_defaults(words: list[str]) -> None:
     words = ["--config", "configs/experiment/puppet.yaml", *words, "--model.decoder.dropout=0.3"]
-    model = print_config(*words, capsys=capsys)["model"]["init_args"]  # type: ignore[index]
+    model = printed_config(*words)["model"]["init_args"]
     assert model["sampler"]["init_args"]["steps"] is None  # and not the five of dpm_solver that stood there
     assert model["decoder"]["init_args"] == {"num_layers": 2, "bidirectional": True, "dropout": 0.3}
 
@@ -237,10 +229,10 @@ QUICK = (
     "config",
     [name if name[:-5] in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in EXPERIMENTS],
 )
-def test_every_shipped_experiment_is_parsed(config: str, capsys: pytest.CaptureFixture[str]) -> None:
-    printed = print_config("--config", f"configs/experiment/{config}", capsys=capsys)
-    assert printed["model"]["init_args"]["dim"]  # type: ignore[index]
-    assert printed["trainer"]["logger"]["init_args"]["name"] == config.removesuffix(".yaml")  # type: ignore[index]
+def test_every_shipped_experiment_is_parsed(config: str) -> None:
+    printed = printed_config("--config", f"configs/experiment/{config}")
+    assert printed["model"]["init_args"]["dim"]
+    assert printed["trainer"]["logger"]["init_args"]["name"] == config.removesuffix(".yaml")
 
 
 NAMED: dict[str, tuple[list[str], str]] = {
@@ -263,9 +255,7 @@ QUICK_NAMES = ("the first of several files", "the option", "an interpolation of 
 @pytest.mark.parametrize(
     "case", [name if name in QUICK_NAMES else pytest.param(name, marks=pytest.mark.slow) for name in NAMED]
 )
-def test_runs_carry_the_name_of_their_experiment(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs_carry_the_name_of_their_experiment(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     mine = "model: DualPathDiffusion\ndata: Puppet\n"
     loggers = "trainer:\n  logger:\n" + "".join(
@@ -277,7 +267,7 @@ def test_runs_carry_the_name_of_their_experiment(
     for name, text in {**files, "extra": "trainer: {max_epochs: 3}\n"}.items():
         (tmp_path / f"{name}.yaml").write_text(text)
     words, expected = NAMED[case]
-    logger = print_config(*words, capsys=capsys)["trainer"]["logger"]  # type: ignore[index]
+    logger = printed_config(*words)["trainer"]["logger"]
     first = logger[0] if isinstance(logger, list) else logger
     assert first["init_args"]["name"] == expected
 

@@ -66,15 +66,7 @@ def test_the_published_config_trains_and_animates(
 
     assert trainer.global_step == 2
     assert {"val/lve", "train/swap", "train/cycle", "train/speech_swap"} <= trainer.callback_metrics.keys()
-    (group,) = trainer.optimizers[0].param_groups
-    assert (group["lr"], group["weight_decay"]) == (1e-4, 0.0)
-    assert model.scale == 1.0
     assert (model.network.speech_content.window, model.network.speech_rate) == (32, 50.0)
-    assert [layer.out_features for layer in model.network.decoder.connected[::2]] == [256, 256, 128, 50]
-    assert [conv.out_channels for conv in model.network.decoder.convolutions] == [64, 128, 256]
-    assert [conv.kernel_size for conv in model.network.decoder.convolutions] == [(5,), (3,), (3,)]
-    assert model.network.style_encoder.token_dims == (32,)
-    assert len(model.network.speech_content.layers) == 3
     assert sorted(set(range(VERTICES)) - set(model.face().tolist())) == EYES.tolist()
     assert not set(model.lower_face().tolist()) & {*EYES.tolist(), *model.assets.regions["upper_face"].tolist()}
     assert len(seen) == 2

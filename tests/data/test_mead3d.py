@@ -41,6 +41,10 @@ def test_3dmead_by_sentence_and_by_identity(tmp_path: Path) -> None:
     by_identity = MiniMead(root=str(root), split="identity")
     found = names_of(by_identity)
     assert {name[:4] for name in found["train"]} == {"M003", "W029"}
+    everyone = [f"{sex}{number:03d}" for sex in "MW" for number in range(1, 50)]
+    clips = {name: MiniMead.parse_name(f"{name}_030_6_2") for name in everyone}
+    for split, named in (("train", data.identities), ("val", MEAD_VAL), ("test_b", MEAD_TEST)):
+        assert [name for name, clip in clips.items() if clip and by_identity.split_of(clip) == split] == named
     assert {name[:4] for name in found["val"]} == {"M032"}
     assert {name[:4] for name in found["test_b"]} == {"W040"}
     assert sum(map(len, found.values())) == len(neutral) + len(emotional)
