@@ -8,6 +8,8 @@ import signal
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import lightning.pytorch as pl
 import pytest
@@ -16,7 +18,13 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, Th
 
 from facediff import registry
 from facediff.callbacks import EmaWithWarmup
-from facediff.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint, random_states, restore_random_states
+from facediff.callbacks.checkpoints import (
+    AtomicCheckpointIO,
+    LastCheckpoint,
+    agreed,
+    random_states,
+    restore_random_states,
+)
 from facediff.callbacks.runs import ResumableCSVLogger
 from facediff.data.batch import clips_in
 from facediff.errors import FaceDiffError
@@ -261,3 +269,17 @@ def test_weights_from_a_forked_process_come_back_and_nothing_else_does(tmp_path:
     plugin.save_checkpoint({"a": torch.ones(3)}, tmp_path / "other.ckpt")
     with pytest.raises(FaceDiffError, match=r"other\.ckpt"):
         plugin.load_checkpoint(tmp_path / "other.ckpt")
+
+
+@pytest.mark.parametrize("requests", [[(False, 0), (True, 0)], [(True, 0), (False, 12)], [(False, 0), (False, 0)]])
+def test_a_request_of_one_process_is_one_of_all(
+    requests: list[tuple[bool, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each process's request, reduced as torch.distributed would over two of them."""
+    values = torch.tensor([[int(due), number] for due, number in requests])
+    trainer: Any = SimpleNamespace(world_size=2, strategy=SimpleNamespace(root_device="cpu"))
+    reductions = {torch.distributed.ReduceOp.MAX: values.amax(0), torch.distributed.ReduceOp.MIN: values.amin(0)}
+    reductions[torch.distributed.ReduceOp.SUM] = values.sum(0)
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda request, op: request.copy_(reductions[op]))
+    together = any(due for due, _ in requests), max(number for _, number in requests)
+    assert [agreed(trainer, *request) for request in requests] == [together] * 2
