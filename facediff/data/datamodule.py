@@ -49,7 +49,7 @@ from facediff.data.measuring import measure_components, measure_scale, measure_w
 from facediff.data.mixing import mixed_loader
 from facediff.data.packed.stores import address_of, is_packed
 from facediff.data.storage import ChannelFolder, ClipStorage
-from facediff.errors import ArgumentError, FaceDiffError, check_known, damaged
+from facediff.errors import ArgumentError, FaceDiffError, check_known, counted, damaged, note
 from facediff.hyperparameters import keeps_arguments, plain, read_options
 from facediff.registry import corpus as corpora
 from facediff.registry import find_class
@@ -481,6 +481,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             )
         policy = self.reference_policy()
         if split.startswith("test"):
+            if self.test_share < 1:
+                note(f"{self.corpus_name}: a sub-sample of {split}, {counted(len(clips), 'clip')} by data.test_share")
             clips = self._with_reference(clips, policy)
         elif not training or self.reference != "self":
             policy.check(clips)

@@ -68,7 +68,8 @@ def test_a_sub_sample_is_tested_and_named(
     model = make_model()
     model.adopt(some.assets().with_motion_scale(some.motion_scale()))
     trainer = make_trainer(logger=CSVLogger(tmp_path), callbacks=[outputs.ScoreTable(media_clips=0)])
-    trainer.test(model, datamodule=some, verbose=False)
+    with pytest.warns(Note, match=r"a sub-sample of test_[ab], \d clips? by data.test_share"):
+        trainer.test(model, datamodule=some, verbose=False)
     assert "30 % of the test clips, a sub-sample" in capsys.readouterr().out
     report = load_json(Path(trainer.log_dir or "") / "test_report.json")
     assert {row["test_share"] for row in report["scores"]} == {0.3}
