@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -92,6 +93,10 @@ def demo(
     tell(f"Next: facediff animate speech.wav --checkpoint {checkpoint} --identity F1 -o speech.mp4")
 
 
+SHOWN = {"closure_auc": "closures (AUC)", "open_vowels": "open vowels", "rounding": "rounding"}
+"""Scores of articulation that are printed."""
+
+
 def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModule) -> list[Path]:
     """Videos with sound, and sheets of frames, of truth next to prediction: the first clip of each test split."""
     import torch
@@ -135,27 +140,32 @@ def write_sheet(path: Path, animations: Sequence[Animation], footer: str = "") -
 
 
 def compare_with_bundled(checkpoint: Path, data: SpeechMotionDataModule) -> list[str]:
-    """Lip vertex errors of ``facediff animate`` with the new and the bundled model, in a line a test split.
+    """Lips of ``facediff animate`` with the new and the bundled model, in a line a test split.
 
-    They are shares of a still face's error, over the same clips; both models choose the style by themselves.
+    Lip vertex errors are shares of a still face's, over the same clips, and articulation of the truth's; both models
+    choose the style by themselves.
     """
     import torch
 
     import facediff
+    from facediff.data.articulation import MouthMotion, articulation, mouth_motion
     from facediff.metrics import lip_vertex_error
+    from facediff.speech.phonemes import phonemes_file, read_phonemes
     from facediff.utils.hub import BUNDLED, is_exported
 
-    if not is_exported(BUNDLED):
+    assets = data.assets()
+    lips, pairs = assets.regions["lips"], assets.inner_lip_pairs
+    if pairs is None or not is_exported(BUNDLED):
         return []
     models = [facediff.load(checkpoint), facediff.load(BUNDLED)]
-    lips = data.assets().regions["lips"]
     lines = []
     for split in data.test_splits:
         dataset = data.dataset(split)
         count = min(COMPARED, len(dataset))
-        errors = []
+        errors, mouths = list[list[float]](), list[list[MouthMotion]]()
         for i in range(count):
             sample = dataset[i * len(dataset) // count]
+            file = phonemes_file(data.root, sample.name)
             truth = sample.motion + sample.template
             # A seed for each clip: samples that share their noise err in the same direction.
             animations = [
@@ -166,9 +176,21 @@ def compare_with_bundled(checkpoint: Path, data: SpeechMotionDataModule) -> list
                 sample.template.expand_as(truth),
             ]
             errors.append([lip_vertex_error(motion, truth, lips).item() for motion in motions])
+            measured = partial(
+                mouth_motion,
+                template=sample.template.numpy(),
+                lip_pairs=pairs.numpy(),
+                millimetres=1000,
+                frame_rate=data.frame_rate,
+                phonemes=[] if file is None else read_phonemes(file),
+            )
+            mouths.append([*(measured(animation.vertices) for animation in animations), measured(truth.numpy())])
         trained, bundled, still = (sum(column) for column in zip(*errors, strict=True))
+        *made, true = (articulation(column) for column in zip(*mouths, strict=True))
+        shares = [each.shares_of(true) for each in made]
         lines.append(
             f"{split}, lip error of animate over a still face's: this model {trained / still:.2f}, "
-            f"the one that comes with facediff {bundled / still:.2f}"
+            f"the one that comes with facediff {bundled / still:.2f}; over the truth's: "
+            + ", ".join(f"{words} {shares[0][name]:.2f}, {shares[1][name]:.2f}" for name, words in SHOWN.items())
         )
     return lines
