@@ -1,22 +1,12 @@
 r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
-The recipe, where flite is installed and no voice of Festival but kal, on one core in about an hour and a half. flite's
-three voices, made from recordings of people, get other pitches and vocal tracts, since they are few and all men's; the
-second ``adapt`` hears six women. (What it adapted for the package is the folder of the first, read back by
-``tools/bundled_checkpoint.py``: the checkpoint was lost.)
+The recipe, where flite is installed and no voice of Festival but kal, in about an hour on two cores. READERS are 121
+people of LibriSpeech with up to two recordings each.
 
-    $ CHANGES="--augmentation voice:share=0.9,semitones=8,formants=0.3,together=0.6 --augmentation loudness:share=0.3 \
-        --augmentation room:share=0.6,seconds=0.8,direct=-4 --augmentation tilt:share=0.6 \
-        --augmentation band:share=0.25 --augmentation codec:share=0.1 --augmentation noise:share=0.7 \
-        --augmentation hum:share=0.1 --augmentation babble --augmentation music"
+    $ facediff data align LibriSpeech -o READERS
     $ facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
-        --model.motion_space.eyelids_weight=20 --trainer.max_epochs=12 \
-        --data.augmentations='["voice:share=1,semitones=8,formants=0.3,together=0.6"]' \
-        --data.augmented_share=0.7 --data.augmented_clips='{voice: "f*"}'
-    $ facediff adapt --checkpoint runs/puppet_quality/version_0/checkpoints/best.ckpt --voices 4800 $CHANGES -o men.ckpt
-    $ python tools/pico_voices.py women
-    $ facediff adapt --checkpoint men.ckpt --voices 1400 --transcribed women --interpolation 0.5 $CHANGES \
-        -o puppet.ckpt
+        --model.motion_space.eyelids_weight=20 --trainer.callbacks+=facediff.callbacks.SpokenSoundsTerm \
+        --trainer.callbacks.recordings=READERS
     $ facediff generation-metrics puppet.ckpt --samples 3 --references 1 --max-clips 30 --json puppet.json
     $ facediff test --ckpt_path puppet.ckpt
     $ python tools/bundled_model.py puppet.ckpt --scores runs/test/version_0/test_scores.csv
@@ -67,8 +57,8 @@ facediff.load().animate("speech.wav", identity="F1", style="F1_lively").save("sp
 """How the folder is used, in place of how a model folder is."""
 SPEECH = """## Who speaks in its corpus
 
-espeak-ng (GPL-3.0), flite (Carnegie Mellon's licence, as free as BSD's) and, for its audio encoder, SVOX Pico
-(Apache-2.0); their licences do not cover what they say.
+espeak-ng (GPL-3.0) and flite (Carnegie Mellon's licence, as free as BSD's), whose licences do not cover what they say. Its
+audio encoder was also taught the sounds of 121 readers of LibriSpeech (Panayotov, Chen, Povey and Khudanpur, 2015; CC BY 4.0).
 
 """
 """Programs whose speech it was trained with."""

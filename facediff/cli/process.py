@@ -38,7 +38,7 @@ LOST_PROCESS = re.compile(
     r"|DataLoader worker .*(killed|exited)",
     re.IGNORECASE,
 )
-"""What PyTorch says where another process of a distributed run, or one that reads data, has gone."""
+"""PyTorch's words where another process of a distributed run, or one that reads data, has gone."""
 
 
 class StandardOutputError(FaceDiffError):

@@ -30,7 +30,7 @@ VOWELS = "iyɨʉɯuɪʏʊeøɘɵɤoəɛœɜɞʌɔæɐaɶɑɒɚɝᵻ"
 
 @dataclass(frozen=True, eq=False)
 class MouthMotion:
-    """The mouth of a recording, and what is said.
+    """The mouth of a recording, and its words.
 
     Attributes:
         gap: (T,) between the inner lips, in millimetres beyond that of the face at rest.

@@ -36,7 +36,7 @@ MOST = 100
 
 
 def visible_sound(ipa: str) -> int:
-    """The place in :data:`SOUNDS` of a phoneme; a pause for what is not known."""
+    """The place in :data:`SOUNDS` of a phoneme; a pause for one that is not known."""
     sound = articulations(ipa)[0] if ipa else PAUSE
     targets = sound.targets
     jaw, pucker = targets.get("jawOpen", 0.0), targets.get("mouthPucker", 0.0)

@@ -25,7 +25,7 @@ _ROUND_TOP = 0.018
 _SURELY_SHUT = 0.028
 UNHURRIED = 0.11
 _CLOSING, _OPENING = (0.050, 0.070), (0.060, 0.085)
-"""Shortest and longest time in seconds that the lower lip takes to what it touches, and away."""
+"""Shortest and longest time in seconds that the lower lip takes to a contact, and away from it."""
 
 # Vowels: how open (0 close to 1 open), how far back (0 front to 1 back) and how rounded they are. IPA chart of 2020.
 _VOWELS: dict[str, tuple[float, float, float]] = {
@@ -67,7 +67,7 @@ class Articulation:
         strength: how much it dominates its neighbours (Cohen and Massaro's magnitude of dominance); weak sounds take
             the shape of the sounds next to them.
         reach: how far its influence spreads in time, as a factor.
-        contact: what the lower lip touches: the upper ``lip`` or ``teeth``, or nothing.
+        contact: the part that the lower lip touches, the upper ``lip`` or ``teeth``, or none.
     """
 
     targets: dict[str, float]
