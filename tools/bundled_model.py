@@ -57,8 +57,9 @@ facediff.load().animate("speech.wav", identity="F1", style="F1_lively").save("sp
 """How the folder is used, in place of how a model folder is."""
 SPEECH = """## Who speaks in its corpus
 
-espeak-ng (GPL-3.0) and flite (Carnegie Mellon's licence, as free as BSD's), whose licences do not cover what they say. Its
-audio encoder was also taught the sounds of 121 readers of LibriSpeech (Panayotov, Chen, Povey and Khudanpur, 2015; CC BY 4.0).
+espeak-ng (GPL-3.0) and flite (Carnegie Mellon's licence, as free as BSD's), whose licences do not cover what they say.
+Its audio encoder was also taught the sounds of 121 readers of LibriSpeech (Panayotov, Chen, Povey and Khudanpur, 2015;
+CC BY 4.0).
 
 """
 """Programs whose speech it was trained with."""
