@@ -28,9 +28,9 @@ ONE_PERSON = ("--model.audio_encoder.frozen=false", "--data.augmentations=null",
 """Settings that were measured with one person, docs/results/people.md."""
 PREVIEW_RATE, CURVES = 25, 96
 """Frames a second, and height of the curves in pixels."""
-LAGS, EARLY, MOST_LAG, ALIKE = 5, 1, 2, 0.4
-"""Frames by which sound and mouth are compared; by which the bundled model moves earlier than people; by which they
-may differ otherwise; and the correlation from which on the comparison counts."""
+LAGS, MOST_LAG, ALIKE = 5, 2, 0.4
+"""Frames by which sound and mouth are compared; by which they may differ; and the correlation from which on the
+comparison counts."""
 CLIPS = 8  # of a person, that are compared
 
 
@@ -169,7 +169,7 @@ def sync_warnings(root: Path, people: Iterable[str]) -> Iterator[str]:
             times = np.arange(len(expected)) / model.frame_rate
             scores.append(correlations(np.interp(times, np.arange(len(gaps)) / rate, gaps), expected, LAGS, 2 * LAGS))
         mean = np.mean(scores, axis=0)
-        late = peak(mean) - EARLY
+        late = peak(mean)
         if mean.max() >= ALIKE and abs(late) >= MOST_LAG:
             size = f"about {1000 * abs(late) / model.frame_rate:.0f} ms {'early' if late > 0 else 'late'}"
             yield f"warning: {person}: the sound is {size}; shift it in the video"
