@@ -159,7 +159,7 @@ def announce(
     tests: Mapping[tuple[str, str], str],
     workers: int | None,
 ) -> None:
-    """List the cells that will run, with what their tests generate and with times."""
+    """List the cells that will run, with the size of their tests and with times."""
     from facediff.utils.text_tables import format_table
 
     at_a_time = f"{workers} at a time" if workers else "one on each worker at a time"

@@ -111,7 +111,7 @@ def to_shuffle(name: str, view: Batch, identities: Sequence[str]) -> Batch | Non
 
 
 def count_generations(data: SpeechMotionDataModule, policy: str, samples: int) -> int:
-    """How many animations a test generates, without what further metrics and the usual style need.
+    """How many animations a test generates, without those for further metrics and for the usual style.
 
     Args:
         data: the corpus.
