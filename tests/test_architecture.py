@@ -6,6 +6,7 @@ import ast
 import functools
 import importlib
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -189,6 +190,29 @@ def test_packages_import_what_they_may(package: str) -> None:
             ):
                 wrong.append(where)
     assert not wrong, "\n".join(wrong)
+
+
+READERS = {
+    r"\bjson\.(loads?|JSONDecoder)\b": {
+        "utils/plain_files.py",
+        # What another part of the same process, or one that it has started, wrote; Blender, without facediff; a word.
+        *("speech/espeak.py", "export/glb_to_fbx.py", "models/published/importing.py"),
+    },
+    # Lightning's logger writes its own columns, which a resumed run continues.
+    r"\bcsv\.(reader|writer|DictReader|DictWriter)\b": {"utils/plain_files.py", "callbacks/runs.py"},
+    r"\bnp\.(lib\.format\.)?(load\w*|from(file|regex)|genfromtxt|read_array|\w*memmap)\((?![^()]*w\+)": {
+        "utils/arrays.py"
+    },
+    # What goes between the processes of a cluster is pickled by Dask anyway, see the top of cluster.py.
+    r"\b(pickle|torch|joblib)\.loads?\(": {"utils/torch_files.py", "utils/cluster.py"},
+}
+"""Readers of files, which believe them in their own ways, and the modules that may call them."""
+
+
+@pytest.mark.parametrize("call", READERS)
+def test_each_kind_of_file_is_read_in_one_place(call: str) -> None:
+    found = {file.relative_to(PACKAGE).as_posix() for file in FILES if re.search(call, file.read_text("utf-8"))}
+    assert found <= READERS[call]
 
 
 def test_the_rule_would_catch_a_breach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

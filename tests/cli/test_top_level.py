@@ -36,14 +36,6 @@ def spied(lines: list[str], heavy: list[str], folder: Path) -> dict[str, tuple[i
     return dict(zip(lines, map(json.loads, run.stdout.splitlines()), strict=True))
 
 
-def test_the_top_level_imports_nothing_heavy(tmp_path: Path) -> None:
-    statuses = {"--help": 0, "": 2, "fitt": 2, "yardsticks": 2, "--version": 0}
-    rows = spied([*statuses], ["torch", "lightning", "numpy", "jsonargparse"], tmp_path)
-    assert {line: (status, heavy) for line, (status, heavy, _) in rows.items()} == {
-        line: (status, []) for line, status in statuses.items()
-    }
-
-
 MISTAKES = [
     "animate",
     "animate --bad",

@@ -82,7 +82,10 @@ def test_parameters_that_lie_in_another_file_are_refused(tmp_path: Path) -> None
     with h5py.File(tmp_path / "complex.h5", "w") as file:
         for name, width in widths.items():
             file[name] = np.zeros((1, 5, width), complex)
-    for name in ("group", "soft", "complex"):
+    with h5py.File(tmp_path / "raw.h5", "w") as file:
+        for name, width in widths.items():
+            file.create_dataset(name, (1, 5, width), "<f4", external=[(str(tmp_path / "other.h5"), 0, 1000 * width)])
+    for name in ("group", "soft", "complex", "raw"):
         with pytest.raises(FaceDiffError, match=rf"{name}\.h5"):
             read_parameters(tmp_path / f"{name}.h5")
 

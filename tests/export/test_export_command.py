@@ -14,19 +14,6 @@ from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
 
 
-def test_archive_needs_no_further_options(
-    animation: Animation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_archive(tmp_path / "in.npz", animation)
-    assert main(["export", str(tmp_path / "in.npz"), "-o", str(tmp_path / "out" / "a.glb")]) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith(f"{tmp_path / 'out' / 'a.glb'}: ")
-    assert said[1].startswith(f"{tmp_path / 'out' / 'a.wav'}: ")
-    assert "Import > glTF" in said[2]
-    assert len(said) == 3
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {"a.glb", "a.wav"}
-
-
 def test_bare_array_is_completed_by_options(
     animation: Animation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import textwrap
@@ -22,7 +21,6 @@ from facediff.synthetic.known_faces import built_in_shapes
 VIDEOS = (".mp4", ".webm", ".gif")
 OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", *VIDEOS, ".npz", ".npy"]
 """Formats that need no blendshapes and no browser page."""
-ROOT = Path(__file__).parents[2]
 
 
 def test_formats_are_as_promised() -> None:
@@ -231,55 +229,6 @@ def test_csv_holds_weights_solved_for_the_shapes(make_animation: Callable[..., A
     table = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     np.testing.assert_allclose(table["JawOpen"], opened, atol=0.03)
     assert np.abs(table["MouthFunnel"]).max() < 0.03
-
-
-BOUNDS = """
-from facediff.export import Format
-from facediff.export.format import FileSpace
-
-class Bounds(Format):
-    "The box around the vertices of every frame, as text."
-
-    next_step = "read it"
-    speech = "next to it"
-
-    def write(self, path, animations, options):
-        (animation,) = animations
-        frames = FileSpace.of(animation, options).frames(animation)
-        path.write_text("".join(f"{frame.min()} {frame.max()} {options.speech_file}\\n" for frame in frames))
-"""
-
-
-def test_format_of_an_installed_package_is_reached_by_its_suffix(animation: Animation, tmp_path: Path) -> None:
-    info = tmp_path / "site" / "bounds-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bounds\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[facediff.export_format]\nbounds = bounds_format:Bounds\n")
-    (tmp_path / "site" / "bounds_format.py").write_text(BOUNDS)
-    write_archive(tmp_path / "in.npz", animation)
-
-    def facediff(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "facediff", *words],
-            capture_output=True,
-            text=True,
-            timeout=120,
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), str(ROOT)])},
-        )
-
-    written = facediff("export", "in.npz", "-o", "y.bounds", "--output-unit", "mm")
-    assert (written.returncode, written.stderr) == (0, "")
-    assert written.stdout.splitlines()[-1] == "read it"
-    lines = (tmp_path / "y.bounds").read_text().splitlines()
-    low, high, speech_file = lines[7].split()
-    frame = animation.vertices[7] * 1000
-    assert (float(low), float(high)) == pytest.approx((frame.min(), frame.max()), rel=1e-6)
-    assert (len(lines), speech_file) == (40, "y.wav")
-    assert (tmp_path / "y.wav").is_file()
-    assert "The box around the vertices" in facediff("export", "--help").stdout
-    refused = facediff("export", "in.npz", "-o", "z.bound")
-    assert (refused.returncode, 'did you mean ".bounds"' in refused.stderr) == (2, True)
 
 
 def test_weights_of_the_built_in_face_need_no_shapes(tmp_path: Path) -> None:

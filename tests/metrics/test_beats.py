@@ -1,4 +1,4 @@
-"""Onsets of sound where they were planted, and a head that nods with them or beside them."""
+"""Onsets by their documented definition, and what a head that nods with them has beyond `further_cases`."""
 
 from __future__ import annotations
 
@@ -23,15 +23,6 @@ def clicks(times: list[float], seconds: float = 4.0) -> torch.Tensor:
     return sound
 
 
-def test_onsets_are_where_sounds_begin() -> None:
-    times = [0.5, 1.3, 2.0, 3.1]
-    for factor in (1.0, 1e-3):
-        found = onsets(factor * clicks(times), RATE)
-        assert found.tolist() == pytest.approx(times, abs=0.02)
-    assert not len(onsets(torch.zeros(RATE), RATE))
-    assert not len(onsets(torch.zeros(0), RATE))
-
-
 @pytest.mark.parametrize("rate", [16_000, 22_050])
 def test_onsets_are_the_documented_peaks_of_spectral_flux(rate: int) -> None:
     """Windows of 32 ms every 10 ms, log(1 + 100 |X|); largest within 30 ms, 0.07 above the mean of 100 ms around."""
@@ -53,31 +44,15 @@ def test_onsets_are_the_documented_peaks_of_spectral_flux(rate: int) -> None:
     assert onsets(torch.from_numpy(sound), rate).tolist() == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_head_that_pauses_on_the_beat_is_aligned_and_one_between_the_beats_is_not() -> None:
-    times = [0.6, 1.4, 2.2, 3.0]
-    frames = torch.arange(100, dtype=torch.float64)
-    # The speed of −cos(ω t) / ω is |sin ω t|, with minima every half turn; one of them lies on the first beat.
-    turn = torch.pi / (0.8 * FPS)
-
-    def nodding(first: float) -> torch.Tensor:
-        return torch.cos(turn * (frames - first * FPS))[:, None, None]
-
-    scores = [
-        head_beat_alignment(
-            nodding(first), nodding(0.6), waveform=clicks(times), frames_per_second=FPS, smoothing=1.0, variance=2.0
-        ).item()
-        for first in (0.6, 1.0)
-    ]
-    assert scores[0] > 0.9
-    assert scores[1] < 0.1
-    narrow = {"waveform": clicks(times), "frames_per_second": FPS, "smoothing": 1.0, "variance": 0.5}
-    assert head_beat_alignment(nodding(0.7), nodding(0.6), **narrow).item() < scores[0]  # type: ignore[arg-type]
-    still = torch.zeros(100, 1, 1)
-    assert head_beat_alignment(still, nodding(0.6), waveform=clicks(times), frames_per_second=FPS).item() == 0
+def test_a_still_head_and_silence() -> None:
+    still, head = torch.zeros(100, 1, 1), torch.randn(100, 1, 1, generator=torch.Generator().manual_seed(0))
+    assert head_beat_alignment(still, head, waveform=clicks([0.6, 1.4]), frames_per_second=FPS).item() == 0
+    assert not len(onsets(torch.zeros(RATE), RATE))
+    assert not len(onsets(torch.zeros(0), RATE))
     with pytest.raises(ValueError, match="onset"):
-        head_beat_alignment(still, still, waveform=torch.zeros(64_000), frames_per_second=FPS)
+        head_beat_alignment(head, head, waveform=torch.zeros(64_000), frames_per_second=FPS)
     with pytest.raises(ValueError, match="frames_per_second"):
-        head_beat_alignment(still, still, waveform=torch.zeros(64_000))
+        head_beat_alignment(head, head, waveform=torch.zeros(64_000))
 
 
 def test_speed_need_not_be_smoothed_and_sound_has_16_khz_unless_it_is_said() -> None:

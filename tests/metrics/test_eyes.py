@@ -61,10 +61,6 @@ def test_limits_count_what_they_say() -> None:
     half, wide = face(blinking(20, 60, depth=0.6, frames=100)), face(blinking(20, frames=100))
     for options, ratio in (({}, 2.0), ({"closed": 0.7}, 0.0), ({"closed": 0.05, "reopened": 0.01}, 2.0)):
         assert fm.blink_rate_ratio(half, wide, LIDS, **options).item() == ratio  # type: ignore[arg-type]
-    words = fm.BlinkRate(LIDS, frames_per_second=12.5, of="truth", closed=0.45, reopened=0.2).describe()
-    assert "blinks of the truth over minutes at 12.5 frames a second" in words
-    assert "above 0.45 after it was below 0.2" in words
-    assert words.endswith("[a minute]")
 
 
 def test_the_ratio_is_one_of_sums_and_the_rate_one_of_minutes() -> None:

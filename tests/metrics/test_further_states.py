@@ -218,18 +218,3 @@ def test_a_collection_feeds_metrics_of_absolute_vertices_and_of_offsets(corpus: 
     assert first["fdd"] == face_dynamics_deviation(upper=UPPER, template=template, **absolute)
     assert first["mod"] == mouth_opening_difference(pairs=PAIRS, **absolute)
     assert first["mod"] != first["mod_by_sequence"]
-
-
-def test_a_collection_does_not_take_different_subjects_for_one(corpus: Corpus) -> None:
-    """Equal sums after the first batch must not make torchmetrics merge metrics of different meaning."""
-    batch = closure_batch(corpus, [1], 0)
-    batch["prediction"] = batch["truth"]
-    rates = {of: BilabialClosureRate(PAIRS, of=of) for of in ("prediction", "truth", "gap")}  # type: ignore[arg-type]
-    collection = MetricCollection(dict(rates))
-    collection.update(**batch)
-    batch = closure_batch(corpus, [2], 0)
-    batch["prediction"] = batch["prediction"].roll(5, 1)
-    collection.update(**batch)
-    values = collection.compute()
-    assert values["gap"].item() == pytest.approx(values["prediction"].item() - values["truth"].item(), abs=1e-15)
-    assert values["prediction"] != values["truth"]

@@ -25,35 +25,6 @@ def mouth(openings: list[float]) -> torch.Tensor:
     return motion
 
 
-def test_the_opening_is_a_mean_over_pairs_and_the_difference_has_no_sign() -> None:
-    truth, prediction = torch.zeros(2, 4, 3), torch.zeros(2, 4, 3)
-    truth[:, 0, 0], truth[:, 2, 1] = 3.0, 1.0
-    prediction[0, 0, 0], prediction[1, 2, 2] = 8.0, 2.0
-    # openings of the truth 2 and 2, of the prediction 4 and 1
-    assert mouth_opening_difference(prediction, truth, [(0, 1), (2, 3)]).item() == 1.5
-
-
-def test_offsets_without_their_neutral_vertices_give_another_number() -> None:
-    neutral = mouth([1.0])[0]
-    truth, prediction = mouth([0.0, 0.5]), mouth([0.5, -0.5])
-    right = mouth_opening_difference(prediction, truth, [(0, 1)], offsets_from=neutral)
-    assert right == mouth_opening_difference(prediction + neutral, truth + neutral, [(0, 1)])
-    assert right.item() == pytest.approx(0.75)
-    assert mouth_opening_difference(prediction, truth, [(0, 1)]).item() == pytest.approx(0.25)
-
-
-def test_closed_is_a_share_of_the_range_of_the_truth() -> None:
-    truth = mouth([0.1, 1.1, 0.1, 0.6, 1.1])
-    prediction = mouth([0.3, 0.0, 0.31, 0.1, 0.2])
-    rate = bilabial_closure_rate(prediction, truth, [(0, 1)], [(0, 1), (2, 4)], threshold=0.205)
-    assert rate.item() == pytest.approx(2 / 3)  # up to 0.305: frames 0 and 3 of 0, 2, 3
-    assert bilabial_closure_rate(prediction, truth, [(0, 1)], [(2, 4)], count="closures").item() == 1.0
-    assert bilabial_closure_rate(prediction, truth, [(0, 1)], [(2, 4)], of="truth").item() == 0.5
-    assert bilabial_closure_rate(prediction, truth, [(0, 1)], [(2, 3)], of="gap").item() == -1.0
-    moved = bilabial_closure_rate(prediction * 7, truth * 7, [(0, 1)], [(0, 1), (2, 4)], threshold=0.205)
-    assert moved == rate
-
-
 def test_the_speed_of_long_motion_loses_no_step() -> None:
     """It is read a few frames at a time; NumPy's definition over all of them."""
     motion = torch.randn(150, 3000, 3, generator=torch.manual_seed(0))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from facediff.metrics import TOPOLOGIES, LipVertexError, Region, lip_vertex_error
+from facediff.metrics import TOPOLOGIES, Region
 
 Indices = Any  # right and wrong ones
 
@@ -56,11 +56,6 @@ def test_the_hash_is_of_the_vertices_only() -> None:
     assert first.hash != Region.from_indices("a", [12]).hash
 
 
-def test_a_region_of_another_mesh_is_refused() -> None:
-    with pytest.raises(ValueError, match="belongs to a mesh of 9 vertices, not of 10"):
-        Region.from_indices("lips", [1], n_vertices=9).check(10)
-
-
 def test_weights_above_a_threshold(tmp_path: Path) -> None:
     weights = [0.0, 0.1, 0.10001, 2e-12, 1.0]
     path = tmp_path / "weighted_mouth_mask.txt"
@@ -93,15 +88,6 @@ def test_unions_hold_each_vertex_once_and_report_the_shared() -> None:
     assert forehead.union(eyes, Region("nose", (0,)), name="upper").indices == (0, 1, 2, 5, 7)
     with pytest.raises(ValueError, match="belongs to a mesh of 9 vertices, not of"):
         eyes | Region("x", (1,), 8)
-
-
-def test_repeated_lip_indices_change_nothing() -> None:
-    truth, prediction = torch.randn(2, 5, 6, 3, generator=torch.manual_seed(0)).unbind(0)
-    twice = lip_vertex_error(prediction, truth, [1, 3, 3, 1])
-    assert twice == lip_vertex_error(prediction, truth, [1, 3])
-    region = LipVertexError([1, 3, 3, 1]).region
-    assert region is not None
-    assert (region.count, region.duplicates) == (2, 2)
 
 
 # Of the meshes themselves, and of the index files and masks that circulate with them.

@@ -9,7 +9,6 @@ from facediff.metrics import (
     IdentityDiversity,
     SampleDiversity,
     identity_diversity,
-    sample_diversity,
 )
 
 
@@ -24,9 +23,6 @@ def test_shuffled_pairs_are_two_halves_and_depend_on_the_seed_alone() -> None:
     assert sorted(index for pair in pairs for index in pair) == list(range(10))
     assert SampleDiversity(n_samples=10).pairs(10) == pairs
     assert len({tuple(SampleDiversity(n_samples=10, seed=seed).pairs(10)) for seed in range(20)}) > 15
-    several = samples(0, 10)
-    by_hand = [(several[0, a] - several[0, b]).norm(dim=-1).mean() for a, b in pairs]
-    torch.testing.assert_close(sample_diversity(several[0]), torch.stack(by_hand).mean(), rtol=1e-12, atol=0)
 
 
 def test_identities_may_differ_in_number_and_one_alone_is_left_out() -> None:

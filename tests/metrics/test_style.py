@@ -74,12 +74,6 @@ def test_a_label_of_its_own_is_found_but_does_not_ask() -> None:
         alone.compute()
 
 
-def test_cosine_sees_no_length_and_euclid_does() -> None:
-    embeddings = torch.tensor([[1.0, 0.0], [50.0, 1.0], [1.0, 1.2], [40.0, 41.0]])
-    assert style_retrieval_accuracy(embeddings, [0, 0, 1, 1]).item() == 1.0
-    assert style_retrieval_accuracy(embeddings, [0, 0, 1, 1], closeness="euclidean").item() == 0.0
-
-
 def test_embeddings_survive_pickling_reset_halving_and_forward() -> None:
     embeddings = torch.randn(8, 4, generator=torch.manual_seed(0))
     labels = [0, 1] * 4
@@ -100,32 +94,17 @@ def test_embeddings_survive_pickling_reset_halving_and_forward() -> None:
     assert collection.compute()["StyleRetrievalAccuracy"] == batch_value
 
 
-def gallery(people: int = 4, clips: int = 9) -> tuple[fm.SpeakerGallery, np.ndarray, np.ndarray]:
+def gallery(people: int = 4, clips: int = 9) -> fm.SpeakerGallery:
     """People whose faces differ little, and vary a lot in one way that all of them share."""
     rng = np.random.default_rng(0)
     own, mood = rng.normal(size=(people, 6, 3)), 5 * rng.normal(size=(6, 3))
     labels = np.repeat(np.arange(people), clips)
     means = own[labels] + rng.normal(size=(len(labels), 1, 1)) * mood + 0.1 * rng.normal(size=(len(labels), 6, 3))
-    return fm.SpeakerGallery(torch.from_numpy(means), tuple(labels.tolist())), own, mood
-
-
-def test_the_nearest_speaker_is_found_whatever_the_mood() -> None:
-    known, own, mood = gallery()
-    rng = np.random.default_rng(1)
-    clips = own[:, None] + 2 * rng.normal(size=(4, 1, 1, 1)) * mood + 0.3 * rng.normal(size=(4, 30, 6, 3))
-    motion = torch.from_numpy(clips)
-    euclid = [np.square(known.means.numpy() - clip.mean(0)).sum((1, 2)).argmin() // 9 for clip in clips]
-    assert euclid != [0, 1, 2, 3]  # mood would decide
-    assert fm.nearest_speaker_accuracy(motion, [0, 1, 2, 3], known, shrinkage=1e-3).item() == 1.0
-    assert fm.nearest_speaker_accuracy(motion, [1, 2, 3, 0], known, shrinkage=1e-3).item() == 0.0
-    template = torch.from_numpy(rng.normal(size=(4, 6, 3)))
-    absolute = motion + template[:, None]
-    found = fm.nearest_speaker_accuracy(absolute, [0, 1, 2, 3], known, shrinkage=1e-3, template=template)
-    assert found.item() == 1.0
+    return fm.SpeakerGallery(torch.from_numpy(means), tuple(labels.tolist()))
 
 
 def test_the_nearest_speaker_is_that_of_the_documented_distance() -> None:
-    known, _, _ = gallery()
+    known = gallery()
     rng = np.random.default_rng(2)
     means, labels = known.means.numpy().reshape(36, -1), np.array(known.speakers)
     for components, shrinkage in ((3, 0.1), (16, 0.5), (40, 0.2)):  # there are 18
@@ -142,23 +121,13 @@ def test_the_nearest_speaker_is_that_of_the_documented_distance() -> None:
         metric = fm.NearestSpeakerAccuracy(known, components=components, shrinkage=shrinkage)
         metric.update(torch.from_numpy(clips), nearest.tolist())
         assert metric.compute().item() == 1.0
-
-
-def test_the_nearest_speaker_follows_from_offsets_alone() -> None:
-    """Where the gallery's faces all lie to one side, this side says nothing of a speaker."""
-    known, own, mood = gallery()
-    rng = np.random.default_rng(3)
-    motion = torch.from_numpy(own[:, None] + rng.normal(size=(4, 1, 1, 1)) * mood + np.zeros((4, 3, 6, 3)))
-    aside = torch.from_numpy(100 * rng.normal(size=(6, 3)))
-    moved = fm.SpeakerGallery(known.means + aside, known.speakers)
-    for gallery_of, shift in ((known, 0 * aside), (moved, aside)):
-        found = fm.NearestSpeakerAccuracy(gallery_of, components=8)
-        found.update(motion + shift, [0, 1, 2, 3])
-        assert found.compute().item() == 1.0
+        template = torch.from_numpy(rng.normal(size=(6, 3)))
+        metric.update(torch.from_numpy(clips) + template, ((nearest + 1) % 4).tolist(), template=template)
+        assert metric.compute().item() == 0.5
 
 
 def test_a_speaker_without_recordings_is_left_out() -> None:
-    known, _, _ = gallery()
+    known = gallery()
     metric = fm.NearestSpeakerAccuracy(known)
     metric.update(known.means[:, None][[0, 0]], [0, 7])
     assert metric.compute().item() == 1.0

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facediff.metrics import TemporalMisalignment, lip_warping_distance, temporal_misalignment, warp
+from facediff.metrics import TemporalMisalignment, temporal_misalignment, warp
 from facediff.metrics.timing import extrema, matched_lags, smooth
 from tests.metrics.further_cases import cheapest_path, gaussian
 
@@ -17,69 +17,25 @@ few = settings(max_examples=40, deadline=None)
 sizes = st.integers(1, 7)
 
 
-def every_path(rows: int, columns: int) -> list[list[tuple[int, int]]]:
-    """All warping paths, by following each step."""
-    if rows == columns == 1:
-        return [[(0, 0)]]
-    found = []
-    for down, right in ((1, 1), (1, 0), (0, 1)):
-        if rows - down >= 1 and columns - right >= 1:
-            found += [[*path, (rows - 1, columns - 1)] for path in every_path(rows - down, columns - right)]
-    return found
-
-
-@few
-@given(st.integers(1, 5), st.integers(1, 5), st.integers(0, 2**31))
-def test_no_path_is_cheaper(rows: int, columns: int, seed: int) -> None:
-    distances = torch.rand(rows, columns, dtype=torch.float64, generator=torch.manual_seed(seed))
-    cost, path = warp(distances)
-    paths = every_path(rows, columns)
-    assert path in paths
-    costs = [sum(distances[cell].item() for cell in some) for some in paths]
-    assert cost == pytest.approx(min(costs), rel=1e-12)
-    assert cost == pytest.approx(sum(distances[cell].item() for cell in path), rel=1e-12)
-
-
 @few
 @given(sizes, sizes, st.integers(0, 2**31))
 def test_ties_are_broken_as_documented(rows: int, columns: int, seed: int) -> None:
     """Small whole numbers tie all the time and add up exactly."""
     distances = torch.randint(0, 3, (rows, columns), generator=torch.manual_seed(seed)).double()
-    assert warp(distances)[1] == cheapest_path(distances.numpy())
-
-
-def test_lips_that_are_only_late_are_at_no_distance() -> None:
-    still = torch.zeros(6, 4, 3, dtype=torch.float64)
-    motion = torch.cat([still, torch.randn(20, 4, 3, dtype=torch.float64, generator=torch.manual_seed(0)), still])
-    late = torch.cat([still[:4], motion])[:-4]
-    distance = lip_warping_distance(late, motion, [0, 3])
-    assert distance < 1e-12 < lip_warping_distance(-late, motion, [0, 3])
-
-
-def sines(shift: float, frames: int = 60) -> torch.Tensor:
-    motion = torch.zeros(frames, 2, 3, dtype=torch.float64)
-    moments = torch.arange(frames) - shift
-    motion[:, 0, 1] = 2 + torch.sin(moments / 3.1) + 0.3 * torch.sin(moments)
-    return motion
-
-
-@pytest.mark.parametrize("shift", [0, 1, 3])
-def test_a_late_mouth_is_late_by_its_delay(shift: int) -> None:
-    lag = temporal_misalignment(sines(shift), sines(0), [(0, 1)])
-    assert lag.item() == pytest.approx(shift, abs=0.35)
-    assert temporal_misalignment(sines(-shift), sines(0), [(0, 1)]).item() == pytest.approx(shift, abs=0.35)
-    in_time = temporal_misalignment(sines(shift), sines(0), [(0, 1)], frames_per_second=30)
-    assert in_time.item() == pytest.approx(lag.item() * 1000 / 30)
+    cost, path = warp(distances)
+    assert path == cheapest_path(distances.numpy())
+    assert cost == sum(distances[cell].item() for cell in path)
 
 
 def test_a_still_face_has_no_misalignment_unless_every_pair_counts() -> None:
     still = torch.zeros(60, 2, 3, dtype=torch.float64)
+    moving = torch.rand(60, 2, 3, dtype=torch.float64, generator=torch.manual_seed(0))
     metric = TemporalMisalignment([(0, 1)])
-    metric.update(still, sines(0))
+    metric.update(still, moving)
     assert metric.coverage().left_out == 1
     with pytest.raises(ValueError, match="pairs no opening or closing"):
         metric.compute()
-    assert temporal_misalignment(still, sines(0), [(0, 1)], at="path") >= 0
+    assert temporal_misalignment(still, moving, [(0, 1)], at="path") >= 0
 
 
 @few

@@ -21,15 +21,6 @@ def test_long_sequences_are_worked_in_pieces_with_the_same_result() -> None:
     assert found.item() == pytest.approx((spreads[0] - spreads[1]).item(), rel=1e-9)
 
 
-def test_offsets_and_absolute_vertices_give_the_same(corpus: Corpus, upper: tuple[int, ...]) -> None:
-    batch = corpus.batch([2, 3])
-    template = batch.pop("template")
-    absolute = face_dynamics_deviation(upper=upper, template=template, **batch)
-    offsets = {name: batch[name].double() - template[:, None] for name in ("prediction", "truth")}
-    moved = face_dynamics_deviation(upper=upper, lengths=batch["lengths"], **offsets)
-    torch.testing.assert_close(absolute, moved, rtol=1e-12, atol=0)
-
-
 def test_one_template_serves_a_whole_batch(corpus: Corpus, upper: tuple[int, ...]) -> None:
     batch = corpus.batch([2, 3])
     shared = batch.pop("template")[0]

@@ -13,7 +13,6 @@ from facediff.data import Mead3D
 from facediff.data.preparation import PreparationReport, prepare
 from facediff.data.prepare import mead3d
 from facediff.data.prepare.mead3d import find_sounds
-from facediff.data.reconstructions import read_parameters
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import Flame
 from facediff.mesh.mesh_files import read_mesh
@@ -135,20 +134,6 @@ def test_all_forms_give_the_same_corpus(tmp_path: Path, flame: Path) -> None:
     for other in others:
         assert {name for name in first if first[name] != other.get(name)} <= {"manifest.json"}
         assert set(other) == set(first)
-
-
-@pytest.mark.parametrize("form", ["flat", "hickle", "array"])
-def test_parameters_of_single_files(form: str, tmp_path: Path) -> None:
-    parts = parameters_of(CLIP)
-    if form == "array":
-        file = write_raw_probtalk3d(tmp_path / "raw", clips=PAIR) / "param" / f"{CLIP}.npy"
-    else:
-        file = hdf5(write_raw_emote(tmp_path / "raw", clips=PAIR, form=form, audio="none"))  # type: ignore[arg-type]
-    found = read_parameters(file)
-    np.testing.assert_allclose(found.shape, parts["shape"].astype(np.float64).mean(0), rtol=1e-12)
-    np.testing.assert_array_equal(found.expression, parts["exp"])
-    np.testing.assert_array_equal(found.jaw, parts["jaw"])
-    assert found.shape.dtype == found.expression.dtype == found.jaw.dtype == np.float64
 
 
 def test_fewer_coefficients_and_other_batches(raw: Path, flame: Path) -> None:
@@ -305,25 +290,6 @@ def test_wrong_parameters_cost_one_clip_and_say_why(
     assert said.startswith(str(hdf5(raw)))
     with pytest.raises(FaceDiffError, match=message):
         raise FaceDiffError(said)
-
-
-def test_a_file_that_points_to_other_files_is_refused(raw: Path, tmp_path: Path) -> None:
-    import h5py
-
-    parts = parameters_of(CLIP)
-    write_hdf5(tmp_path / "other.hdf5", parts)
-    with h5py.File(hdf5(raw), "w") as file:
-        file["exp"] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), "exp")
-        file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
-    with pytest.raises(FaceDiffError, match="exp lies in another file"):
-        read_parameters(hdf5(raw))
-    (tmp_path / "secret").write_bytes(parts["exp"].astype("<f4").tobytes())
-    with h5py.File(hdf5(raw), "w") as file:
-        outside = [(str(tmp_path / "secret"), 0, h5py.h5f.UNLIMITED)]
-        file.create_dataset("exp", parts["exp"].shape, "<f4", external=outside)
-        file["shape"], file["jaw"] = parts["shape"], parts["jaw"]
-    with pytest.raises(FaceDiffError, match="exp lies in another file"):
-        read_parameters(hdf5(raw))
 
 
 def test_a_repaired_clip_is_written_by_a_second_run_but_shapes_are_never_mixed(raw: Path, flame: Path) -> None:

@@ -61,17 +61,6 @@ def wild(frames: int = 12) -> np.ndarray:
     return np.random.default_rng(3).uniform(-0.6, 1.6, (frames, len(NAMES)))
 
 
-def test_known_weights_come_back_from_a_motion_as_stored() -> None:
-    made = shapes(vertices=1000)
-    made = replace(made, neutral=made.neutral.astype(np.float32).astype(np.float64))
-    known = np.random.default_rng(2).uniform(0, 1, (20, 5))
-    animation = animation_of(made, known)
-    stored = replace(
-        animation, vertices=animation.vertices.astype(np.float32), template=animation.template.astype(np.float32)
-    )
-    assert np.abs(solve(stored, made, PLAIN).values - known).max() < 1e-6
-
-
 @pytest.mark.parametrize(
     "options",
     [
