@@ -88,30 +88,3 @@ def test_speech_feature_cache_gives_windows_their_part(
     found, encoded = losses(SpeechFeatureCache(str(tmp_path)), window=7)
     assert all(map(torch.isfinite, map(torch.tensor, found)))
     assert encoded == 10
-
-
-def test_speech_feature_window_is_where_the_motion_window_is(tiny_root: Path) -> None:
-    data = Tiny(root=str(tiny_root), window=5)
-    # Features that count frames in half steps, as an encoder with two steps a frame would give.
-    data.features.reader = lambda clip: torch.arange(2.0 * data.corpus.frames(clip))[:, None]
-    dataset = data.dataset("train", training=True)
-    for _ in range(10):
-        sample = dataset[0]
-        whole = data.corpus.read_motion(dataset.clips[0])
-        (start,) = (i for i in range(len(whole) - 4) if torch.equal(whole[i : i + 5], sample.motion))
-        assert sample.features is not None
-        assert sample.features.flatten().tolist() == list(range(2 * start, 2 * start + 10))
-
-
-@pytest.mark.slow
-def test_speech_feature_cache_replaces_a_damaged_file(
-    losses: Callable[..., tuple[list[float], int]], tmp_path: Path
-) -> None:
-    first, _ = losses(SpeechFeatureCache(str(tmp_path)))
-    files = sorted(tmp_path.rglob("*.npy"))
-    assert len(files) == 10
-    files[3].write_bytes(files[3].read_bytes()[:90])
-    with pytest.warns(UserWarning, match="a damaged or half-written cache file"):
-        again, encoded = losses(SpeechFeatureCache(str(tmp_path)))
-    assert again == first
-    assert encoded == 1

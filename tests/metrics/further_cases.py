@@ -1,8 +1,7 @@
 """Every metric with every option: how to make it, what to feed it, and its formula in float64 NumPy.
 
 The formulas are written from the definitions, one sequence at a time, without looking at the package. A
-formula gives (value, weight) of a sequence, or None where the sequence has no value. Imported by the tests and, as a
-file beside it, by distributed_worker.py.
+formula gives (value, weight) of a sequence, or None where the sequence has no value.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import torch
 from facediff import registry
 from facediff.data import collate
 from facediff.errors import FaceDiffError
-from facediff.models import DualPathDiffusion, losses
+from facediff.models import DualPathDiffusion
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]
@@ -24,14 +24,7 @@ def model(ready: Make) -> DualPathDiffusion:
     return ready()
 
 
-def test_the_loss_is_the_weighted_sum_of_eq_15(model: DualPathDiffusion, tiny: Tiny) -> None:
-    batch = collate([tiny.dataset("val")[0]])
-    terms = model.losses(batch, torch.Generator().manual_seed(0))
-    expected = terms["reconstruction"] + 0.003 * (terms["velocity"] + terms["acceleration"]) + 0.0005 * terms["face"]
-    torch.testing.assert_close(terms["loss"], expected)
-
-
-def test_the_loss_of_a_clip_does_not_depend_on_its_padding(model: DualPathDiffusion, tiny: Tiny) -> None:
+def test_the_prediction_of_a_clip_does_not_depend_on_its_padding(model: DualPathDiffusion, tiny: Tiny) -> None:
     dataset = tiny.dataset("train")
     short, long = dataset[0], dataset[7]
     alone, together = collate([short]), collate([short, long])
@@ -45,12 +38,6 @@ def test_the_loss_of_a_clip_does_not_depend_on_its_padding(model: DualPathDiffus
     first = model.network(noisy, step, model.conditions(alone))
     second = model.network(padded, step.expand(2), model.conditions(together))
     torch.testing.assert_close(second[:1, :frames], first, atol=1e-4, rtol=1e-4)
-    for loss in (losses.reconstruction_loss, losses.velocity_loss, losses.acceleration_loss):
-        truth = clean.view(1, frames, 24, 3)
-        one = loss(first.view(1, frames, 24, 3), truth, alone.mask)
-        longer = torch.nn.functional.pad(truth, (0, 0, 0, 0, 0, 9))
-        guess = torch.nn.functional.pad(first.view(1, frames, 24, 3), (0, 0, 0, 0, 0, 9), value=7.0)
-        torch.testing.assert_close(loss(guess, longer, torch.arange(frames + 9)[None] < frames), one)
 
 
 @pytest.mark.parametrize(

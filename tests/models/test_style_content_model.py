@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch, collate
-from facediff.models import Style, StyleContentDisentanglement, load_model
+from facediff.models import Style, load_model
 from facediff.models.losses import style_contrast
 from facediff.models.style_content.losses import (
     Alignments,
@@ -144,44 +144,15 @@ class TestLosses:
         alone = pair_up(pairs(tiny, "A_e01", "A_e02"), Alignments(25.0))
         assert alone.partner.tolist() == [0, 1], "two sentences of one person: nothing to swap"
 
-    def test_training_batches_are_pairs_of_one_sentence(self, tiny: Tiny, make_trainer: MakeTrainer) -> None:
-        model, seen = make(), []
-        model.losses_of = model.losses  # type: ignore[attr-defined]
-
-        def note(batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-            if model.training:
-                seen.append(list(zip(batch.identity_names, batch.sentences, strict=True)))
-            return model.losses_of(batch, generator)  # type: ignore[attr-defined]
-
-        model.losses = note  # type: ignore[method-assign]
-        make_trainer(max_epochs=2).fit(model, datamodule=Tiny(root=str(tiny.root), batch_size=4))
-        assert len(seen) == 4
-        for batch in seen:
-            for (one, first), (other, second) in zip(batch[::2], batch[1::2], strict=True):
-                assert first == second
-                assert one != other
-
-    def test_ablations_are_one_override_each(self, tiny: Tiny) -> None:
-        batch = pairs(tiny, "A_e01", "B_e01")
-
-        def gradients(**options: object) -> dict[str, Tensor]:
-            model = make(**options)
+    def test_pairs_need_not_be_aligned(self, tiny: Tiny) -> None:
+        found = []
+        for aligned in (True, False):
+            model = make(aligned_pairs=aligned)
             model.adopt(tiny.assets().with_motion_scale(100.0))
             model.attach_mesh()
             model.alignment_allowed = lambda: True  # type: ignore[method-assign]
-            return {name: value.detach() for name, value in model.losses(batch).items()}
-
-        full = gradients()
-        for option, term in (
-            ({"swap_weight": 0.0}, 3 * (1 * full["swap"] + 2 * full["speech_swap"])),
-            ({"cycle_weight": 0.0}, full["cycle"] + 2 * full["speech_cycle"]),
-            ({"speech_content_weight": 0.0}, 5 * full["speech_content"]),
-        ):
-            without = gradients(**option)
-            torch.testing.assert_close(full["loss"] - without["loss"], term, rtol=1e-4, atol=1e-4)
-        apart = gradients(aligned_pairs=False)
-        assert float(apart["recording_content"]) == 0 < float(full["recording_content"])
-        assert float(apart["swap"]) != float(full["swap"])
+            found.append(model.losses(pairs(tiny, "A_e01", "B_e01"))["recording_content"].item())
+        assert found[0] > 0 == found[1]
 
     def test_every_parameter_gets_a_gradient(self, tiny: Tiny) -> None:
         for options in ({}, {"mesh_encoder": registry.mesh_encoder.linear}):
@@ -245,12 +216,3 @@ class TestTrained:
         speech = torch.randn(16_000)
         one = model.animate(speech, identity="A", style=reference).vertices
         torch.testing.assert_close(one, model.animate(speech, identity="A", style=Style("B", vector)).vertices)
-
-    def test_swapping_keeps_the_content_given(self, trained: Path) -> None:
-        model = load_model(trained)
-        assert isinstance(model, StyleContentDisentanglement)
-        mask = masks(9)
-        content = model.encode_content(torch.randn(1, 9, VERTICES, 3), mask).detach()
-        # Mean and spread over the clip are taken out.
-        torch.testing.assert_close(content.mean(1), torch.zeros(1, 8), atol=1e-5, rtol=0)
-        assert float((content.std(1, correction=0) - 1).abs().max()) < 0.05
