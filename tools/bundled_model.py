@@ -1,7 +1,7 @@
 r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
-The recipe, where flite is installed and no voice of Festival but kal, in an hour and a quarter on two cores. READERS are
-121 people of LibriSpeech with up to two recordings each.
+The recipe, where flite is installed and no voice of Festival but kal, in an hour and a quarter on two cores. READERS
+are 121 people of LibriSpeech with up to two recordings each.
 
     $ facediff data align LibriSpeech -o READERS
     $ FIT="facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
