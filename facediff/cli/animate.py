@@ -118,12 +118,12 @@ def animate(
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     checkpoint = model_or_bundled(checkpoint)
     check_animating_source(checkpoint)
-    from facediff.export import FORMATS, check_used
+    from facediff.export import check_used, is_film
 
     file = Path(f"a{batch.suffix}") if is_batch else Path("a.npy") if stream else output
     check_used(file.suffix, files.changed())
-    is_seen = file.suffix == ".html" or (file.suffix in FORMATS and "view" in FORMATS[file.suffix].uses)
-    is_seen = is_seen or (target.target_mesh is not None and holds_glb(file))
+    is_avatar = target.target_mesh is not None and holds_glb(file)
+    is_seen = file.suffix == ".html" or is_film(file.suffix) or is_avatar
     refuse_idle(
         "is for videos, pages and avatars: other files have the model's motion alone", still=still and not is_seen
     )

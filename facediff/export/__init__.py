@@ -8,6 +8,6 @@ Example:
 
 from facediff.animation.options import ExportOptions
 from facediff.export.format import Format
-from facediff.export.writing import FORMATS, check_export, check_used, write_animations
+from facediff.export.writing import FORMATS, check_export, check_used, is_film, write_animations
 
-__all__ = ["FORMATS", "ExportOptions", "Format", "check_export", "check_used", "write_animations"]
+__all__ = ["FORMATS", "ExportOptions", "Format", "check_export", "check_used", "is_film", "write_animations"]

@@ -199,6 +199,11 @@ def have_weights(animations: Sequence[Animation]) -> bool:
     return all(map(has_arkit_weights, animations))
 
 
+def is_film(suffix: str) -> bool:
+    """Whether a file of this suffix holds pictures of the face that move: a video or a GIF."""
+    return suffix in FORMATS and "view" in FORMATS[suffix].uses
+
+
 def check_used(suffix: str, option_names: Collection[str]) -> None:
     """Refuse options that the format of a suffix does not use; an unknown suffix is refused elsewhere.
 

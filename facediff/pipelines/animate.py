@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from facediff.speech.audio import SpeechRecording
     from facediff.speech.windows import WindowPlan
 
-VIDEOS = (".mp4", ".webm")
 PIXEL_SECONDS = 4e-8  # What drawing and encoding a pixel of a video takes
 
 Progress = Callable[[int, int], object]
@@ -274,10 +273,12 @@ class AnimationPipeline(ABC):
 
     def cost(self, seconds_of_speech: float, output: Path, size: int) -> tuple[float, float]:
         """Roughly the seconds on two processor cores, and the bytes, that :meth:`write` takes for some speech."""
+        from facediff.export import is_film
+
         duration = self.options.samples * seconds_of_speech
         frames = duration * self.frame_rate
         seconds = self.step_seconds * duration
-        if output.suffix in VIDEOS:
+        if is_film(output.suffix):
             seconds += PIXEL_SECONDS * frames * size**2
         return seconds, 12 * frames * len(self.facts["template"])
 

@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 import facediff
+from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
+from facediff.export import FORMATS
+from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime.folder import read_folder
 from facediff.speech.audio import read_speech
 from facediff.synthetic.cast import SEEN, UNSEEN
@@ -72,6 +75,13 @@ def test_a_stream_opens_the_mouth_no_wider_than_the_recording_does() -> None:
         ):
             peaks.append(float(((vertices - motion.template) * jaw).sum(axis=(1, 2)).max() / (jaw**2).sum()))
     assert np.mean(stream) < 1.2 * np.mean(recording)
+
+
+def test_films_take_the_time_of_their_pictures() -> None:
+    pipeline = ExportedPipeline(AnimationOptions(checkpoint=str(hub.BUNDLED)))
+    seconds = {suffix: pipeline.cost(10.0, Path(f"hello{suffix}"), 1080)[0] for suffix in FORMATS}
+    longer = {suffix for suffix, each in seconds.items() if each > 2 * seconds[".npz"]}
+    assert longer == {".mp4", ".webm", ".gif"}
 
 
 def test_its_name_is_taken_unless_a_file_is_called_so(
