@@ -20,7 +20,7 @@ from facediff.animation import Animation
 from facediff.animation.archives import FORMAT as ARCHIVE
 from facediff.errors import FaceDiffError
 from facediff.export.format import outward
-from facediff.export.viewer.packing import Blobs, millimetres
+from facediff.export.viewer.packing import Blobs, millimetres, pack_mesh
 from facediff.export.viewer.page import assemble, script_of
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
 from facediff.runtime.graph_check import check_graph
@@ -123,20 +123,21 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
         raise FaceDiffError(
             f"{title}: holds no triangles, which a picture needs; export a model of a corpus with a mesh"
         )
-    face = Animation(
-        title,
-        arrays["templates"][:1].astype(np.float32),
-        arrays["templates"][0].astype(np.float32),
-        description.frame_rate,
-        faces=arrays["faces"].astype(np.int32),
-        unit=description.unit,
-    )
+    name, blobs = description.known[0], Blobs()
+    number = description.faces.index(name)
+    template = arrays["templates"][number].astype(np.float32)
+    colours = arrays.get("colours")
+    if colours is not None and colours.ndim == 3:
+        colours = colours[number]
+    triangles = arrays["faces"].astype(np.int32)
+    face = Animation(title, template[None], template, description.frame_rate, faces=triangles, unit=description.unit)
+    mesh = pack_mesh(millimetres(face) * template, outward(face), colours, blobs)
     facts: dict[str, Any] = {
         "format": FORMAT,
         "archive": ARCHIVE,
         "checkpoint": title,
         "millimetres": millimetres(face),
-        "inward": not np.array_equal(outward(face), face.triangles),
+        "face": {**mesh, "name": name, "frameRate": description.frame_rate},
         "delays": DELAYS,
         "recordings": recordings,
         "rests": description.voice_gate != OFF,
@@ -144,7 +145,7 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
     }
     values = {"title": html.escape(title)}
     styles = "style.css", "talk.css"
-    return "".join(assemble("talk.html", styles, SCRIPTS, values, facts, Blobs(), loads=LOADS, own_scripts=True))
+    return "".join(assemble("talk.html", styles, SCRIPTS, values, facts, blobs, loads=LOADS, own_scripts=True))
 
 
 def gate_facts(text: str) -> dict[str, float]:

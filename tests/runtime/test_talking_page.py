@@ -13,11 +13,11 @@ import pytest
 import soundfile
 
 import facediff
-from facediff.animation import Animation, read_archive
+from facediff.animation import Animation, metres_per_unit, read_archive
 from facediff.pipelines.export_model import export_model
 from facediff.runtime.folder import read_folder
 from facediff.runtime.onnxruntime_web import web_runtime
-from facediff.runtime.site import make_site
+from facediff.runtime.site import PAGE, make_site
 from facediff.speech.audio import read_speech
 from tests.fakes.chromium import Chromium, Page
 from tests.fakes.contrasts import CONTRASTS
@@ -164,6 +164,20 @@ def test_page_plays_and_obeys_keys_and_buttons(page: Page, tmp_path: Path) -> No
     assert page.evaluate("facediff.page.animated.names.identity") == "B"
     page.evaluate("(document.getElementById('again').click(), document.getElementById('cancel').click())")
     page.wait_for("!facediff.page.job && !facediff.page.animated")
+
+
+def test_the_face_needs_nothing_but_the_page(
+    site: dict[str, bytes | Path], folder: Path, browser: Chromium, serve: Serve
+) -> None:
+    """It is drawn before worker, ONNX Runtime and model are asked for, none of which this site has."""
+    page = browser.open(serve({PAGE: site[PAGE]}))
+    page.wait_for("window.facediff?.errors.length")
+    assert page.evaluate("document.body.classList.contains('ready') && facediff.page.stage.shown > 0")
+    description, arrays = read_folder(folder)
+    template = arrays["templates"][description.faces.index(description.known[0])]
+    found = np.reshape(page.evaluate("[...facediff.page.stage.face.positions]"), (-1, 3))
+    np.testing.assert_allclose(found, 1000 * metres_per_unit(description.unit) * template, rtol=1e-5, atol=1e-3)
+    page.close()
 
 
 def test_an_example_of_the_site_is_animated_as_a_chosen_file(page: Page) -> None:

@@ -77,6 +77,27 @@ def millimetres(animation: Animation) -> float:
     return 1000 * metres_per_unit(animation.unit)
 
 
+def pack_mesh(
+    points: npt.NDArray[np.floating],
+    triangles: npt.NDArray[np.integer],
+    colours: npt.NDArray[np.integer] | None,
+    blobs: Blobs,
+) -> dict[str, int | None]:
+    """Keep a mesh at rest and return the numbers of its blobs.
+
+    Args:
+        points: (V, 3) in mm.
+        triangles: (F, 3), outward, since pages show the back of one as the hollow of the mouth.
+        colours: red, green and blue from 0 to 255 (V, 3), if any.
+        blobs: where they are kept.
+    """
+    return {
+        "template": blobs.add(points.astype("<f4").tobytes()),
+        "faces": blobs.add(triangles.astype("<u4").tobytes()),
+        "colours": None if colours is None else blobs.add(colours.astype(np.uint8).tobytes()),
+    }
+
+
 def pack_motion(animation: Animation, blobs: Blobs) -> list[int]:
     """Keep a motion and return the numbers of its blobs, one for every `CHUNK_FRAMES` frames.
 

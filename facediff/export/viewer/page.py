@@ -32,6 +32,7 @@ from facediff.export.viewer.packing import (
     heat_scale_end,
     millimetres,
     mouth_opening,
+    pack_mesh,
     pack_motion,
 )
 from facediff.export.viewer.posing import acted_curves, moods, pose_fields, sounds
@@ -215,10 +216,7 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
         "name": animation.name,
         "vertices": len(animation.template),
         "triangles": len(animation.triangles),
-        "template": blobs.add(template.astype("<f4").tobytes()),
-        # Outward, since the script shows the back of a triangle as the hollow of the mouth.
-        "faces": blobs.add(outward(animation).astype("<u4").tobytes()),
-        "colours": None if animation.colours is None else blobs.add(animation.colours.astype(np.uint8).tobytes()),
+        **pack_mesh(template, outward(animation), animation.colours, blobs),
         "opening": None if opening is None else blobs.add(opening.astype("<f4").tobytes()),
         "chunks": pack_motion(animation, blobs),
         "centre": centre,

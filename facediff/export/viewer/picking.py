@@ -34,7 +34,7 @@ from facediff.editing.surface import Surface
 from facediff.editing.symmetry import Plane, symmetry_plane
 from facediff.errors import FaceDiffError
 from facediff.export.format import outward
-from facediff.export.viewer.packing import Blobs, bounds, millimetres
+from facediff.export.viewer.packing import Blobs, bounds, millimetres, pack_mesh
 from facediff.export.viewer.page import assemble
 from facediff.mesh import Mesh, Similarity
 from facediff.mesh.parts import MeshPart
@@ -204,9 +204,7 @@ def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict
     return {
         "name": animation.name,
         "vertices": len(points),
-        "template": blobs.add(points.astype("<f4").tobytes()),
-        "faces": blobs.add(animation.triangles.astype("<u4").tobytes()),
-        "colours": None if animation.colours is None else blobs.add(animation.colours.astype(np.uint8).tobytes()),
+        **pack_mesh(points, animation.triangles, animation.colours, blobs),
         "centre": centre,
         "extent": extent,
         "whole": {"centre": whole_centre, "extent": whole_extent},

@@ -15,6 +15,12 @@ async function readBlob(number) {
   return new Response(stream).arrayBuffer();
 }
 
+/** A mesh at rest: positions (3 V, mm), triangles (3 F, outward), and colours (3 V) or null, by the numbers of its blobs. */
+async function readMesh({ template, faces, colours }) {
+  const [positions, triangles, tints] = await Promise.all([template, faces, colours].map((number) => number === null ? null : readBlob(number)));
+  return { template: new Float32Array(positions), faces: new Uint32Array(triangles), colours: tints && new Uint8Array(tints) };
+}
+
 /** Let the browser draw and handle events. */
 const breathe = () => new Promise((resolve) => setTimeout(resolve, 0));
 

@@ -543,12 +543,12 @@ function withoutParts(faces, runs) {
 }
 
 async function readSide(side) {
-  const positions = new Float32Array(await readBlob(side.template));
+  const { template: positions, faces, colours } = await readMesh(side);
   return {
     positions,
     normals: new Float32Array(positions.length),
-    faces: new Uint32Array(await readBlob(side.faces)),
-    colours: side.colours === null ? null : new Uint8Array(await readBlob(side.colours)),
+    faces,
+    colours,
     distances: null,
     centre: side.centre,
   };

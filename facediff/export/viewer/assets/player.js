@@ -2,14 +2,12 @@
 
 /** One animation, ready to be drawn. */
 async function readFace(facts, animation) {
-  const positions = new Float32Array(await readBlob(animation.template));
+  const mesh = await readMesh(animation), positions = mesh.template.slice();
   return {
+    ...mesh,
     animation,
-    template: positions.slice(),
     positions,
     normals: new Float32Array(positions.length),
-    faces: new Uint32Array(await readBlob(animation.faces)),
-    colours: animation.colours === null ? null : new Uint8Array(await readBlob(animation.colours)),
     opening: animation.opening === null ? null : new Float32Array(await readBlob(animation.opening)),
     distances: animation.compared ? new Float32Array(animation.vertices) : null,
     centre: animation.centre,

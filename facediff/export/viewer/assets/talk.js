@@ -61,17 +61,18 @@ class TalkingPage {
     this.say(first ? "hear an example, open a recording, drop one here, or switch the microphone on" : "");
   }
 
-  /** Show the face that the model moves, while the rest of it still loads. */
+  /** Show the face, which lies in the page, before anything is loaded. */
+  async appear() {
+    this.stage = new Stage(find("view"), find("stage"), await readMesh(this.facts.face), this.facts.face.frameRate);
+    document.body.classList.add("ready");
+  }
+
+  /** What the model offers, while the rest of it still loads. */
   meet({ about, arrays }) {
     if (this.about) return;
     Object.assign(this, { about, arrays });
     this.size = 3 * arrays.templates.shape[1];
-    const faces = Uint32Array.from(arrays.faces.data);
-    if (this.facts.inward) for (let i = 0; i < faces.length; i += 3) [faces[i], faces[i + 1]] = [faces[i + 1], faces[i]];
-    this.stage = new Stage(find("view"), find("stage"), { template: this.template(0), faces, colours: this.colours(0) }, about.frame_rate);
-    this.stage.push(null);
     this.fill();
-    document.body.classList.add("ready");
   }
 
   send(message, transfer = []) {
@@ -111,8 +112,8 @@ class TalkingPage {
     options("identity", about.faces);
     options("style", about.styles);
     for (const id of ["style", "seed", "expressivity"]) find(id).closest("label").hidden = !this.offers(id);
-    find("identity").value = about.identities.find((name) => about.faces.includes(name)) ?? about.faces[0];
-    this.wear();
+    find("identity").value = this.facts.face.name;
+    this.suit();
     const usual = about.windows;
     const drawn = about.blending === "steps" ? {} : { ahead: 0 }; // no noise of the frames ahead
     this.delays = this.facts.delays.map((each) => ({ ...usual, past: 0, ...each, ...drawn })).filter((each) => each.seconds < usual.seconds);
@@ -138,12 +139,17 @@ class TalkingPage {
     return { style: source !== "none", seed: generation === "sampled", expressivity: last >= 0 }[choice];
   }
 
-  /** Show the chosen face, and its own style if it has one. */
-  wear() {
+  /** The chosen face's own style, if it has one. */
+  suit() {
     const name = find("identity").value;
     const style = [`${name}_lively`, name].find((each) => this.about.styles.includes(each));
     if (style) find("style").value = style;
-    const number = this.about.faces.indexOf(name);
+  }
+
+  /** Show the chosen face. */
+  wear() {
+    this.suit();
+    const number = this.about.faces.indexOf(find("identity").value);
     this.stage.wear(this.template(number), this.colours(number));
   }
 
@@ -604,6 +610,7 @@ async function start() {
   if (typeof DecompressionStream === "undefined") {
     throw new Error("this browser is too old for this page: use Chrome or Edge 111, Firefox 114, Safari 16.4 or newer");
   }
+  await page.appear();
   await page.load("wasm");
   find("computed").hidden = !(navigator.gpu && (await navigator.gpu.requestAdapter().catch(() => null)));
   page.tick();
