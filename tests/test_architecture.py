@@ -257,21 +257,33 @@ HEAVY = {"lightning", "pytorch_lightning", "transformers", "diffusers", "jsonarg
 HEAVY |= {"soundfile", "soxr", "cv2", "av", "PIL", "wandb", "rich", "beartype"}
 
 
+LIGHT = HEAVY | {"torch", "numpy", "torchmetrics"}
+THREADS = "from facediff.utils.jobs import run_tasks\nassert dict(run_tasks(len, ['a'], mode='threads')) == {'a': 1}"
+
+
 @pytest.mark.parametrize(
-    "program",
+    ("program", "left_out"),
     [
-        "import facediff",
-        "import facediff.registry, facediff.errors, facediff.models, facediff.data",
-        "from facediff.cli.app import main\nassert main(['--help']) == 0",
-        "from facediff.cli.app import main\nassert main(['--version']) == 0",
-        "from facediff.cli.app import main\nassert main(['fitt']) == 2\nassert main([]) == 2",
+        ("import facediff", LIGHT),
+        ("import facediff.registry, facediff.errors, facediff.models, facediff.data", LIGHT),
+        ("from facediff.cli.app import main\nassert main(['--help']) == 0", LIGHT),
+        ("from facediff.cli.app import main\nassert main(['--version']) == 0", LIGHT),
+        ("from facediff.cli.app import main\nassert main(['fitt']) == 2\nassert main([]) == 2", LIGHT),
+        ("import facediff.data.check.clip", {"torch", "lightning", "trimesh"}),
+        (THREADS, {"dask", "distributed", "cloudpickle"}),
+        ("from facediff import registry\nprint([kind.names() for kind in registry.COMPONENTS.values()])", HEAVY),
     ],
 )
-def test_the_light_parts_load_nothing_heavy(program: str) -> None:
-    loaded = {name.split(".")[0] for name in modules_after(program)}
-    assert not loaded & (HEAVY | {"torch", "numpy", "torchmetrics"})
+def test_the_light_parts_load_nothing_heavy(program: str, left_out: set[str]) -> None:
+    assert not {name.split(".")[0] for name in modules_after(program)} & left_out
 
 
-def test_components_and_samplers_import_their_libraries_late() -> None:
-    program = "from facediff import registry\nprint([kind.names() for kind in registry.COMPONENTS.values()])"
-    assert not {name.split(".")[0] for name in modules_after(program)} & HEAVY
+def test_metrics_bring_torch_and_torchmetrics_and_nothing_else() -> None:
+    before = modules_after("import torchmetrics")
+    # torchmetrics itself takes transformers, matplotlib and others along where they are installed, but not these.
+    assert not {name.split(".")[0] for name in before} & {"lightning", "jsonargparse", "diffusers", "jaxtyping"}
+    loaded = modules_after("import facediff.metrics") - before
+    assert {name.split(".")[0] for name in loaded} - {"facediff"} <= set(sys.stdlib_module_names)
+    ours = {name for name in loaded if name.startswith("facediff") and not name.startswith("facediff.metrics")}
+    utils = {f"facediff.utils{part}" for part in ("", ".hints", ".lazy", ".limits")}
+    assert ours == {"facediff", "facediff.errors", "facediff.registry", "facediff.version", *utils}

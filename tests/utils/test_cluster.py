@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -145,18 +144,6 @@ def test_a_cluster_without_workers_is_given_up(monkeypatch: pytest.MonkeyPatch) 
         pytest.raises(FaceDiffError, match="worker"),
     ):
         list(run_tasks(place, [0], scheduler=empty.scheduler_address))
-
-
-def test_nothing_imports_dask_unless_a_cluster_is_asked_for() -> None:
-    import subprocess
-
-    program = (
-        "import sys\nfrom facediff.utils.jobs import run_tasks\n"
-        "assert dict(run_tasks(len, ['a'], mode='threads', scheduler=None)) == {'a': 1}\n"
-        "assert not {'dask', 'distributed', 'cloudpickle'} & set(sys.modules)\n"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != jobs.ADDRESS}
-    assert subprocess.run([sys.executable, "-c", program], env=environment, check=False).returncode == 0
 
 
 # SLURM, with programs in place of sbatch and scancel.
