@@ -61,8 +61,8 @@ class EncoderOptions:
             features, such as mel or mel:num_layers=6
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
             docs/voices.md); --low-latency does not unless it is given
-        transcribed: with --voices, of a model of the built-in corpus: folder of people's recordings, NAME.wav or .flac
-            of up to 15 s, each with its words in NAME.txt, or in NAME.de.txt if they are German
+        recordings: with --voices: folder of people's recordings, .wav or .flac, which the encoder also learns to hear
+            in other rooms and with noise
         interpolation: share of the distilled weights in the audio encoder's (0.85 with
             --voices, 1 with --low-latency): less changes clean speech less
     """
@@ -71,7 +71,7 @@ class EncoderOptions:
     augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]", needs="voices low_latency")] = (
         None
     )
-    transcribed: Annotated[Path | None, Option(metavar="DIR", reads=True, needs="voices")] = None
+    recordings: Annotated[Path | None, Option(metavar="DIR", reads=True, needs="voices")] = None
     interpolation: Annotated[ranges.Interpolation | None, Option(metavar="SHARE", needs="voices low_latency")] = None
 
 
@@ -130,9 +130,8 @@ def adapt(
         if low_latency is not None:
             options = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
         else:
-            options = DistillationOptions(
-                steps=voices or ranges.USUAL_VOICE_STEPS, seed=seed, transcribed=encoder.transcribed
-            )
+            steps = voices or ranges.USUAL_VOICE_STEPS
+            options = DistillationOptions(steps=steps, seed=seed, recordings=encoder.recordings)
         options = replace(
             options,
             augmentations=encoder.augmentation or options.augmentations,

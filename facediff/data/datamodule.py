@@ -321,16 +321,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """
         return None
 
-    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32] | None:  # noqa: ARG002
-        """A text by one of the corpus's speakers, who take turns by number, (S,) at 16 kHz.
-
-        It is in the speakers' own language, English, or in another by espeak-ng's name, such as de.
-
-        None if they cannot speak on demand, as people cannot. With it an audio encoder is trained on people's
-        recordings of the same words (:mod:`facediff.models.transcribed`).
-        """
-        return None
-
     def default_reference(self, clips: list[Clip]) -> Clip:
         """The clip that gives an identity's style when no other is chosen."""
         return clips[0]

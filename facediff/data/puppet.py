@@ -21,11 +21,10 @@ from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER, ChannelFolder, Cl
 from facediff.errors import FaceDiffError
 from facediff.spaces import Rotation, Space
 from facediff.synthetic import corpus as puppet
-from facediff.synthetic.cast import ALIGNED, CAST, MOST_DRAWN, SEEN, UNSEEN, drawn_names, recorded_names
+from facediff.synthetic.cast import ALIGNED, MOST_DRAWN, SEEN, UNSEEN, drawn_names, recorded_names
 from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.known_faces import built_in_rig as built_in_rig
 from facediff.synthetic.recordings import speakers_of
-from facediff.synthetic.voices import in_language
 from facediff.utils.arrays import open_array, open_vertices
 from facediff.utils.files import cache_dir
 from facediff.utils.licences import Commercial
@@ -213,12 +212,6 @@ class Puppet(SpeechMotionDataModule):
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]]:
         """Random words by the training speakers."""
         return partial(puppet.spoken_words, identities=tuple(self.identities), people=self.voices)
-
-    def say(self, text: str, number: int, language: str = "") -> npt.NDArray[np.float32]:
-        """A text by one of the seen speakers in neutral mood; they take turns."""
-        speaker = SEEN[number % len(SEEN)]
-        voice = f"espeak:{in_language(CAST[speaker].voice.removeprefix('espeak:'), language)}"
-        return puppet.speak_clip(puppet.PerformedClip(speaker, "train", 1, text, "neutral", voice)).samples
 
     def stores_reference(self, identity: str) -> bool:
         """True for the cast: drawn speakers are there to learn from, and 42 of their clips take 90 MB."""

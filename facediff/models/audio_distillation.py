@@ -32,10 +32,10 @@ from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.augmentation import Augmenter, SpeechAugmentation, read_augmentations
-from facediff.errors import FaceDiffError, refuse_idle
+from facediff.errors import FaceDiffError, OptionError, refuse_idle
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
-from facediff.models.transcribed import STEP_RATE, TranscribedRecording, read_transcribed
+from facediff.speech.audio import read_speech
 from facediff.speech.windows import QUIETEST, WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import USUAL_VOICE_STEPS
@@ -58,12 +58,15 @@ ROBUST_AUGMENTATIONS = (
 WINDOW = 4.0
 """Seconds of a clip in a batch, at most."""
 
+STEP_RATE = 50
+"""Features a second at which student and teacher are compared."""
 LOW_LATENCY_WINDOW = (0.6, 1.7)
 """Seconds of speech that a low-latency student gets, at least and at most."""
 
 
-MOST_TRANSCRIBED = 1200
-"""Recordings with words that are used; of more, so many are drawn. Three seconds each take a quarter of a gigabyte."""
+MOST_RECORDINGS, LONGEST = 1200, 8.0
+"""People's recordings that are used, of more so many are drawn, and seconds of each. They take 0.6 GB at most."""
+SOUNDS = (".wav", ".flac", ".ogg", ".mp3")
 
 
 @dataclass(frozen=True)
@@ -85,9 +88,8 @@ class DistillationOptions:
         workers: processes that augment speech; 0 for this one.
         low_latency: the student gets the speech of the model's windows at low latency; the teacher the whole recording.
         complete_share: with ``low_latency``, the share of the pieces of which the student gets all the same everything.
-        transcribed: folder of people's recordings with their words
-            (:func:`facediff.models.transcribed.read_transcribed`), or None.
-        transcribed_share: of the pieces that are such recordings.
+        recordings: folder of people's recordings, which the teacher hears as they are; None for the corpus alone.
+        recorded_share: of the pieces that are such recordings.
     """
 
     augmentations: Sequence[str] = ROBUST_AUGMENTATIONS
@@ -102,8 +104,8 @@ class DistillationOptions:
     workers: int = 1
     low_latency: bool = False
     complete_share: float = 0.3
-    transcribed: Path | None = None
-    transcribed_share: float = 0.3
+    recordings: Path | None = None
+    recorded_share: float = 0.4
 
     @property
     def goal(self) -> str:
@@ -181,16 +183,14 @@ def distil_audio_encoder(
     if not weights:
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
     if options.low_latency:
-        refuse_idle("is an option of {voices}", transcribed=options.transcribed is not None)
+        refuse_idle("is an option of {voices}", recordings=options.recordings is not None)
     teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
     with model.choosing():
         if options.low_latency:
             model.choose_low_latency()
         windows = model.windows
-    recordings: list[TranscribedRecording] = []
-    if options.transcribed is not None:
-        recordings = read_transcribed(options.transcribed, data, teacher, limit=MOST_TRANSCRIBED, seed=options.seed)
+    recordings = [] if options.recordings is None else read_recordings(options.recordings, options.seed)
     pairs = SpeechPairs(data, Augmenter(augmentations), options, windows, recordings)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
@@ -293,11 +293,11 @@ class SpeechPairs(Dataset[DistillationBatch]):
         augmenter: Augmenter,
         options: DistillationOptions,
         windows: WindowPlan,
-        transcribed: Sequence[TranscribedRecording] = (),
+        recordings: Sequence[npt.NDArray[np.float32]] = (),
     ) -> None:
         # Not the data module itself, which may hold what cannot be pickled for a worker.
         self.corpus, self.clips, self.further_speech = data.corpus, data.clips("train"), data.further_speech()
-        self.augmenter, self.options, self.windows, self.transcribed = augmenter, options, windows, transcribed
+        self.augmenter, self.options, self.windows, self.recordings = augmenter, options, windows, recordings
         self._further_pieces: dict[int, npt.NDArray[np.float32]] = {}
 
     def __len__(self) -> int:
@@ -310,16 +310,10 @@ class SpeechPairs(Dataset[DistillationBatch]):
         random = np.random.default_rng([self.options.seed, index])
         clean, augmented, steps_of = [], [], []
         for _ in range(self.options.batch_size):
-            if self.transcribed and random.random() < self.options.transcribed_share:
-                recording = self.transcribed[int(random.integers(len(self.transcribed)))]
-                speech, student_speech, steps = recording.window(WINDOW, random)
-                if self.options.pauses and random.random() < self.options.pauses:
-                    speech, student_speech, steps = with_pause_in_both(speech, student_speech, steps, random)
-            else:
-                speech = self._speech(random)
-                if self.options.pauses and random.random() < self.options.pauses:
-                    speech = with_pause(speech, random)
-                student_speech, steps = speech, np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE))
+            speech = self._speech(random)
+            if self.options.pauses and random.random() < self.options.pauses:
+                speech = with_pause(speech, random)
+            student_speech, steps = speech, np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE))
             clean.append(speech)
             if random.random() < self.options.share:
                 student_speech = self._augmented(student_speech, random)
@@ -360,15 +354,15 @@ class SpeechPairs(Dataset[DistillationBatch]):
         return Piece(piece, np.arange(start, end + silent), compared, mean, deviation)
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
-        """A clip or a piece of further speech, or a random window of it."""
+        """A clip, a person's recording or a piece of further speech, or a random window of it."""
+        if self.recordings and random.random() < self.options.recorded_share:
+            return _window(self.recordings[int(random.integers(len(self.recordings)))], random)
         limit = max(1, round(WINDOW * self.corpus.frame_rate))
         if self.further_speech is not None and self.options.extra_speech and random.random() < 0.5:
             number = int(random.integers(self.options.extra_speech))
             if number not in self._further_pieces:
                 self._further_pieces[number] = self.further_speech(number)
-            speech = self._further_pieces[number]
-            start = int(random.integers(max(1, len(speech) - round(WINDOW * SAMPLE_RATE) + 1)))
-            return speech[start : start + round(WINDOW * SAMPLE_RATE)]
+            return _window(self._further_pieces[number], random)
         clip = self.clips[int(random.integers(len(self.clips)))]
         frames = self.corpus.frames(clip)
         start = int(random.integers(frames - limit + 1)) if frames > limit else 0
@@ -379,27 +373,27 @@ class SpeechPairs(Dataset[DistillationBatch]):
         return self.augmenter.change_speech(speech, int(random.integers(2**31)))
 
 
+def read_recordings(folder: Path, seed: int) -> list[npt.NDArray[np.float32]]:
+    """People's recordings in any folders below one, (S,) at 16 kHz each."""
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SOUNDS)
+    if not files:
+        raise OptionError("recordings", "no recording there; expected .wav or .flac", folder)
+    chosen = np.random.default_rng(seed).permutation(len(files))[:MOST_RECORDINGS]
+    return [read_speech(files[number])[: round(LONGEST * SAMPLE_RATE)] for number in chosen]
+
+
+def _window(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
+    """A random window of :data:`WINDOW` seconds at most."""
+    size = round(WINDOW * SAMPLE_RATE)
+    start = int(random.integers(max(1, len(speech) - size + 1)))
+    return speech[start : start + size]
+
+
 def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
     """Speech (S,) with a faint pause of 0.3 to 1.5 s, often at an end; what no longer fits is cut off."""
     start, count = _drawn_pause(len(speech), SAMPLE_RATE, random)
     pause = _faint(count, speech, random)
     return np.concatenate([speech[:start], pause, speech[start : len(speech) - count]])
-
-
-def with_pause_in_both(
-    teacher: npt.NDArray[np.float32],
-    student: npt.NDArray[np.float32],
-    steps: npt.NDArray[np.int64],
-    random: np.random.Generator,
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """A window of a :class:`TranscribedRecording` with a pause between the same sounds of both."""
-    size = SAMPLE_RATE // STEP_RATE
-    start, count = _drawn_pause(len(steps), STEP_RATE, random)
-    at = int(steps[min(start, len(steps) - 1)])
-    pause = _faint(count * size, student, random)
-    student = np.concatenate([student[: start * size], pause, student[start * size :]])[: len(student)]
-    teacher = np.concatenate([teacher[: at * size], pause, teacher[at * size :]])
-    return teacher, student, np.concatenate([steps[:start], at + np.arange(count), steps[start:] + count])[: len(steps)]
 
 
 def _drawn_pause(length: int, rate: int, random: np.random.Generator) -> tuple[int, int]:
