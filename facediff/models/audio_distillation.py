@@ -6,8 +6,8 @@ student must reproduce the features that the teacher, the encoder as it was, com
 Seltzer, Wang, Zhao and Gong 2017, "Large-scale domain adaptation via teacher-student learning"). A step costs a small
 part of a training step, and no motion is needed. In the end the weights are interpolated between teacher and student,
 which gives back most of the accuracy on clean speech and keeps most of the robustness (Wortsman et al. 2022, "Robust
-fine-tuning of zero-shot models"). Recordings of people with their words teach it other voices than augmentations make:
-there the teacher hears the corpus's own synthesiser say the same words (:mod:`facediff.models.transcribed`).
+fine-tuning of zero-shot models"). People's recordings are heard beside the corpus's, so that it knows their voices in
+other rooms as well as the teacher knows them in their own.
 
 **Low latency.** The student gets truncated speech, which ends a moment after a frame, and must reproduce the teacher's
 features of the whole recording up to that end. Some pieces stay whole, so that recordings sound as before. The student

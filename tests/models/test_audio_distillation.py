@@ -19,8 +19,10 @@ from facediff.models.audio_distillation import (
     SpeechPairs,
     distil_audio_encoder,
     encoder_weights,
+    read_recordings,
 )
 from facediff.models.base import AnimationModel
+from facediff.speech.audio import write_wav
 from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, WindowPlan
 from tests.fakes.tiny import Tiny
 
@@ -132,6 +134,21 @@ def test_further_speech_is_heard_as_often_as_clips(make_model: Callable[..., Ani
     data.asked.clear()
     distil_audio_encoder(make_model(), data, replace(FEW, extra_speech=0))
     assert not data.asked
+
+
+def test_people_are_heard_in_their_share_of_the_pieces(tiny: Tiny, tmp_path: Path) -> None:
+    loud = np.random.default_rng(0).uniform(-0.5, 0.5, 80_000).astype(np.float32)
+    (tmp_path / "reader").mkdir()
+    write_wav(tmp_path / "reader" / "a.wav", loud, 16_000)
+    options = replace(FEW, steps=20, batch_size=8, pauses=0, share=0, recordings=tmp_path, recorded_share=0.25)
+    (speech,) = recordings = read_recordings(tmp_path, seed=0)
+    np.testing.assert_allclose(speech, loud, atol=1e-4)
+    pairs = SpeechPairs(tiny, Augmenter([]), options, LOW_LATENCY_AHEAD, recordings)
+    lengths = torch.cat([pairs[index].lengths for index in range(len(pairs))])
+    heard = (lengths == 4 * 16_000).float().mean()  # clips of the corpus are shorter
+    assert heard == pytest.approx(0.25, abs=0.1)
+    with pytest.raises(FaceDiffError, match="no recording there"):
+        read_recordings(tmp_path / "nowhere", seed=0)
 
 
 def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> None:
