@@ -197,9 +197,11 @@ def test_points_are_picked_mirrored_taken_back_and_saved(serve: Serve, picking: 
     page.wait_for("window.facediffPicking && document.body.classList.contains('ready')")
     assert page.evaluate("document.querySelector('#target .file').textContent") == "<b>other</b>\udcff.obj"
     assert page.evaluate("document.getElementById('save').disabled")
-    # The built-in face is known: its points are there, each at its vertex.
-    for name, place in places(page, "source").items():
-        assert np.array_equal(place, talking().template[MARKS[name]])
+    # The face's points are found by its shape, so that they lie near its vertices.
+    found = places(page, "source")
+    assert len(found) > 5
+    for name, place in found.items():
+        assert np.linalg.norm(place - talking().template[MARKS[name]]) < 0.005, name
     rest = other_face().vertices
     for name in ("nose_tip", "mouth_corner_left", "eye_outer_left"):
         choose(page, name)
