@@ -61,7 +61,7 @@ class EncoderOptions:
             features, such as mel or mel:num_layers=6
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
             docs/voices.md); --low-latency does not unless it is given
-        recordings: with --voices: folder of people's recordings, .wav or .flac, which the encoder also learns to hear
+        people: with --voices: folder of people's recordings, .wav or .flac, which the encoder also learns to hear
             in other rooms and with noise
         interpolation: share of the distilled weights in the audio encoder's (0.85 with
             --voices, 1 with --low-latency): less changes clean speech less
@@ -71,7 +71,7 @@ class EncoderOptions:
     augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]", needs="voices low_latency")] = (
         None
     )
-    recordings: Annotated[Path | None, Option(metavar="DIR", reads=True, needs="voices")] = None
+    people: Annotated[Path | None, Option(metavar="DIR", reads=True, needs="voices")] = None
     interpolation: Annotated[ranges.Interpolation | None, Option(metavar="SHARE", needs="voices low_latency")] = None
 
 
@@ -131,7 +131,7 @@ def adapt(
             options = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
         else:
             steps = voices or ranges.USUAL_VOICE_STEPS
-            options = DistillationOptions(steps=steps, seed=seed, recordings=encoder.recordings)
+            options = DistillationOptions(steps=steps, seed=seed, people=encoder.people)
         options = replace(
             options,
             augmentations=encoder.augmentation or options.augmentations,

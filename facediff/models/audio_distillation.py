@@ -88,7 +88,7 @@ class DistillationOptions:
         workers: processes that augment speech; 0 for this one.
         low_latency: the student gets the speech of the model's windows at low latency; the teacher the whole recording.
         complete_share: with ``low_latency``, the share of the pieces of which the student gets all the same everything.
-        recordings: folder of people's recordings, which the teacher hears as they are; None for the corpus alone.
+        people: folder of people's recordings, which the teacher hears as they are; None for the corpus alone.
         recorded_share: of the pieces that are such recordings.
     """
 
@@ -104,7 +104,7 @@ class DistillationOptions:
     workers: int = 1
     low_latency: bool = False
     complete_share: float = 0.3
-    recordings: Path | None = None
+    people: Path | None = None
     recorded_share: float = 0.4
 
     @property
@@ -183,14 +183,14 @@ def distil_audio_encoder(
     if not weights:
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
     if options.low_latency:
-        refuse_idle("is an option of {voices}", recordings=options.recordings is not None)
+        refuse_idle("is an option of {voices}", people=options.people is not None)
     teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
     with model.choosing():
         if options.low_latency:
             model.choose_low_latency()
         windows = model.windows
-    recordings = [] if options.recordings is None else read_recordings(options.recordings, options.seed)
+    recordings = [] if options.people is None else read_recordings(options.people, options.seed)
     pairs = SpeechPairs(data, Augmenter(augmentations), options, windows, recordings)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
@@ -377,7 +377,7 @@ def read_recordings(folder: Path, seed: int) -> list[npt.NDArray[np.float32]]:
     """People's recordings in any folders below one, (S,) at 16 kHz each."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SOUNDS)
     if not files:
-        raise OptionError("recordings", "no recording there; expected .wav or .flac", folder)
+        raise OptionError("people", "no recording there; expected .wav or .flac", folder)
     chosen = np.random.default_rng(seed).permutation(len(files))[:MOST_RECORDINGS]
     return [read_speech(files[number])[: round(LONGEST * SAMPLE_RATE)] for number in chosen]
 

@@ -140,7 +140,7 @@ def test_people_are_heard_in_their_share_of_the_pieces(tiny: Tiny, tmp_path: Pat
     loud = np.random.default_rng(0).uniform(-0.5, 0.5, 80_000).astype(np.float32)
     (tmp_path / "reader").mkdir()
     write_wav(tmp_path / "reader" / "a.wav", loud, 16_000)
-    options = replace(FEW, steps=20, batch_size=8, pauses=0, share=0, recordings=tmp_path, recorded_share=0.25)
+    options = replace(FEW, steps=20, batch_size=8, pauses=0, share=0, people=tmp_path, recorded_share=0.25)
     (speech,) = recordings = read_recordings(tmp_path, seed=0)
     np.testing.assert_allclose(speech, loud, atol=1e-4)
     pairs = SpeechPairs(tiny, Augmenter([]), options, LOW_LATENCY_AHEAD, recordings)

@@ -57,7 +57,7 @@ def test_prepared_conditions_give_the_same_features(make_model: Make, variant: d
     model = make_model(**variant).double().eval()
     network, dim = model.network, variant.get("dim", DIM)
     given = conditions(dim, padded=padded)
-    for known in (given, given.frames(2, 9)):
+    for known in (given, given.frames(torch.arange(2, 9))):
         space = network.prepare_for_inference(known, model.process.steps, folded=False)
         for step in (0, 17, model.process.steps - 1):
             motion, steps = torch.randn(*known.audio.shape).double(), torch.tensor([step, step])

@@ -96,7 +96,7 @@ def test_sound_out_of_step_with_the_mouth(
     speech = read_speech(example_recordings()[0])
     expected = facediff.load("puppet").animate(speech, 16_000, seed=0)
     gaps = 100 * pair_distances(expected.vertices, np.asarray(expected.inner_lip_pairs))  # centimetres
-    late = np.roll(gaps, frames + 1)  # as people, a frame later than the model
+    late = np.roll(gaps, frames)
     video = write_coded_video(tmp_path / "eva.mp4", [Look(float(gap)).picture() for gap in late], sound=speech)
     assert main(["data", "track", str(video), "-o", str(tmp_path / "people"), "--workers", "1", "--quiet"]) == 0
     found = [line for line in capsys.readouterr().out.splitlines() if "the sound is" in line]

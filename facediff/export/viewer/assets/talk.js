@@ -112,7 +112,8 @@ class TalkingPage {
     options("identity", about.faces);
     options("style", about.styles);
     for (const id of ["style", "seed", "expressivity"]) find(id).closest("label").hidden = !this.offers(id);
-    find("identity").value = this.facts.face.name;
+    const { name } = this.facts.face; // of a model that was changed since, perhaps no face
+    find("identity").value = about.faces.includes(name) ? name : about.faces[0];
     this.suit();
     const usual = about.windows;
     const drawn = about.blending === "steps" ? {} : { ahead: 0 }; // no noise of the frames ahead
