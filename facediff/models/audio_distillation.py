@@ -313,12 +313,9 @@ class SpeechPairs(Dataset[DistillationBatch]):
             speech = self._speech(random)
             if self.options.pauses and random.random() < self.options.pauses:
                 speech = with_pause(speech, random)
-            student_speech, steps = speech, np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE))
             clean.append(speech)
-            if random.random() < self.options.share:
-                student_speech = self._augmented(student_speech, random)
-            augmented.append(student_speech)
-            steps_of.append(steps)
+            steps_of.append(np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE)))
+            augmented.append(self._augmented(speech, random) if random.random() < self.options.share else speech)
         teacher = _padded(clean), _lengths(clean)
         if not self.options.low_latency:
             counts = _lengths(steps_of)
@@ -391,20 +388,10 @@ def _window(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt
 
 def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
     """Speech (S,) with a faint pause of 0.3 to 1.5 s, often at an end; what no longer fits is cut off."""
-    start, count = _drawn_pause(len(speech), SAMPLE_RATE, random)
-    pause = _faint(count, speech, random)
+    count = min(round(random.uniform(0.3, 1.5) * SAMPLE_RATE), len(speech) // 2)
+    start = round(float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (len(speech) - count))
+    pause = random.standard_normal(count).astype(np.float32) * float(np.abs(speech).max(initial=0)) * np.float32(1e-4)
     return np.concatenate([speech[:start], pause, speech[start : len(speech) - count]])
-
-
-def _drawn_pause(length: int, rate: int, random: np.random.Generator) -> tuple[int, int]:
-    """Where a pause begins in something of that length, and how long it is."""
-    count = min(round(random.uniform(0.3, 1.5) * rate), length // 2)
-    return round(float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (length - count)), count
-
-
-def _faint(count: int, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
-    """So many samples of noise far below a piece of speech."""
-    return random.standard_normal(count).astype(np.float32) * float(np.abs(speech).max(initial=0)) * np.float32(1e-4)
 
 
 def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:

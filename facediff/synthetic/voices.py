@@ -88,16 +88,6 @@ def open_voice(name: str) -> Synthesiser:
     return synthesiser
 
 
-def in_language(voice: str, language: str) -> str:
-    """One of espeak-ng's voices, such as ``en-us+f2``, in another language; as it is if that is empty."""
-    if not language:
-        return voice
-    languages = Espeak.voices()
-    if languages and language not in languages:  # without espeak-ng, speaking says how to install it
-        raise FaceDiffError(f'language "{language}": espeak-ng does not speak it; {choices(language, languages)}')
-    return f"{language}+{voice.partition('+')[2]}"
-
-
 def installed_voices() -> dict[str, list[str]]:
     """Voices by synthesiser, where there are any."""
     return {name: voices for name in puppet_voice.names() if (voices := puppet_voice.get(name).voices())}
