@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, Any
 
 import torch
@@ -215,21 +216,22 @@ class EvaluationCorpus(ScoredCorpus):
             if set(request.needs) <= self.offered.has.keys()
         }
 
-    def mouth(self, clip: Clip, offsets: Tensor) -> MouthMotion | None:
-        """The mouth of a motion (frames, V, 3) of a clip; None where lips, lengths or phonemes are not known."""
+    def mouths(self, clip: Clip, *motions: Tensor) -> list[MouthMotion]:
+        """The mouth of motions (frames, V, 3) of a clip; none where lips, lengths or phonemes are not known."""
         scored, file = self.assets.scored, phonemes_file(self.data.root, clip.name)
         if file is None or scored.inner_lip_pairs is None or scored.unit not in METRES:
-            return None
+            return []
         rest = scored.template(clip.identity).cpu().numpy()
-        return mouth_motion(
-            offsets.cpu().numpy() + rest,
-            rest,
-            scored.inner_lip_pairs.cpu().numpy(),
+        measured = partial(
+            mouth_motion,
+            template=rest,
+            lip_pairs=scored.inner_lip_pairs.cpu().numpy(),
             millimetres=1000 * METRES[scored.unit],
             frame_rate=scored.frame_rate,
             phonemes=read_phonemes(file),
             lip_teeth_pairs=None if self.teeth is None else self.teeth.numpy(),
         )
+        return [measured(motion.cpu().numpy() + rest) for motion in motions]
 
     def references(self, clip: Clip, template: str) -> dict[str, Clip]:
         """A clip's references by their owner; ``template`` is the name of the usual one."""
@@ -292,7 +294,7 @@ class Measurement:
             for group in ("channels", "channel_samples"):
                 self.metrics[group] = {name: metric.to(device) for name, metric in self.metrics[group].items()}
         self.speed = RealTimeFactor(device_name(device))
-        self.mouths: list[tuple[MouthMotion, MouthMotion]] = []
+        self.mouths: list[list[MouthMotion]] = []  # of each clip: made and true
 
     def _update(self, group: str, inputs: Mapping[str, Any]) -> None:
         for metric in self.metrics.get(group, {}).values():
@@ -310,9 +312,8 @@ class Measurement:
             self._update(every, {**inputs, "samples": motion.expand(-1, self.compared, -1, -1, -1)})
             for one_sample in motion.unbind(1):
                 self._update(key, {**inputs, "prediction": one_sample})
-        mouths = corpus.mouth(clip, motion[0, 0]), corpus.mouth(clip, truth[0])
-        if mouths[0] and mouths[1]:
-            self.mouths.append((mouths[0], mouths[1]))
+        if mouths := corpus.mouths(clip, motion[0, 0], truth[0]):
+            self.mouths.append(mouths)
         mean = corpus.decoded(corpus.mean_faces.of([clip.identity]).to(batch.motion)[:, None], [clip.identity])
         faces = {"still": torch.zeros_like(truth), "mean_face": mean.expand_as(truth), "truth": truth}
         for face, motion in faces.items():
