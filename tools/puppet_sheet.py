@@ -21,12 +21,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from facediff.render import contact_sheet  # noqa: E402
 from facediff.render.rasteriser import FIELD_OF_VIEW, Camera, Renderer, opencv  # noqa: E402
 from facediff.spaces.arkit import LEFT_AND_RIGHT  # noqa: E402
+from facediff.synthetic.articulation import LIP_AT_TEETH  # noqa: E402
 from facediff.synthetic.cast import CAST  # noqa: E402
 from facediff.synthetic.head.mesh import QuadMesh  # noqa: E402
 from facediff.synthetic.head.parts import build_head  # noqa: E402
 from facediff.synthetic.head.people import Complexion, coloured, dressed  # noqa: E402
 from facediff.synthetic.head.rig import head_shapes  # noqa: E402
-from facediff.synthetic.performance import LIP_AT_TEETH  # noqa: E402
 
 Points = NDArray[np.float64]
 Picture = NDArray[np.uint8]

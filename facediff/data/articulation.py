@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from facediff.data.track.face import pair_distances
 from facediff.speech.phonemes import TimedPhoneme, closing
+from facediff.synthetic.articulation import VOWELS
 
 Array = npt.NDArray[np.float64]
 
@@ -25,7 +26,6 @@ LENGTH = "ː"
 OPEN_VOWELS = ("a", "ɑ", "æ", "ɐ", "ɒ")
 ROUNDED = ("u", "ʊ", "w", "o", "ɔʊ", "əʊ", "oʊ")
 LABIODENTALS = ("f", "v")
-VOWELS = "iyɨʉɯuɪʏʊeøɘɵɤoəɛœɜɞʌɔæɐaɶɑɒɚɝᵻ"
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ _CLOSING, _OPENING = (0.050, 0.070), (0.060, 0.085)
 """Shortest and longest time in seconds that the lower lip takes to a contact, and away from it."""
 
 # Vowels: how open (0 close to 1 open), how far back (0 front to 1 back) and how rounded they are. IPA chart of 2020.
-_VOWELS: dict[str, tuple[float, float, float]] = {
+VOWELS: dict[str, tuple[float, float, float]] = {
     **{"i": (0.0, 0.0, 0.0), "y": (0.0, 0.0, 1.0), "ɨ": (0.0, 0.5, 0.0), "ʉ": (0.0, 0.5, 1.0), "ɯ": (0.0, 1.0, 0.0)},
     **{"u": (0.0, 1.0, 1.0), "ɪ": (0.17, 0.15, 0.0), "ʏ": (0.17, 0.15, 1.0), "ʊ": (0.17, 0.85, 1.0)},
     **{"e": (0.33, 0.0, 0.0), "ø": (0.33, 0.0, 1.0), "ɘ": (0.33, 0.5, 0.0), "ɵ": (0.33, 0.5, 1.0)},
@@ -80,7 +80,7 @@ PAUSE = Articulation({}, strength=1.1, reach=0.9)
 
 
 def _vowel(symbol: str) -> Articulation:
-    opened, back, rounded = _VOWELS[symbol]
+    opened, back, rounded = VOWELS[symbol]
     spread = (1.0 - rounded) * (1.0 - back)
     targets = {
         # The jaw turns by about 9 degrees for an open vowel (Vatikiotis-Bateson and Ostry, 1995).
@@ -96,9 +96,14 @@ def _vowel(symbol: str) -> Articulation:
     return Articulation(targets, strength=0.45 if reduced else 0.85 + 0.35 * max(opened, rounded))
 
 
+LIP_AT_TEETH = {
+    **{"jawOpen": 0.07, "mouthRollLower": 0.72, "mouthUpperUp": 0.4},
+    **dict.fromkeys(("mouthLowerDown", "mouthFunnel", "mouthPucker", "mouthStretch", "mouthShrugLower"), 0.0),
+}
+"""Weights at which the lower lip lies at the edge of the upper incisors, which are seen."""
 _PLACES: dict[str, Articulation] = {
     "bilabial": Articulation({"jawOpen": 0.06, "mouthPress": 0.45, "mouthShrugLower": 0.1}, 0.6, 0.8, "lip"),
-    "labiodental": Articulation({"jawOpen": 0.07, "mouthUpperUp": 0.4}, 0.8, 0.7, "teeth"),
+    "labiodental": Articulation({name: LIP_AT_TEETH[name] for name in ("jawOpen", "mouthUpperUp")}, 0.8, 0.7, "teeth"),
     "dental": Articulation(
         {"jawOpen": 0.11, "mouthLowerDown": 0.25, "mouthUpperUp": 0.12, "tongueForward": 0.9}, 0.7, 0.8
     ),
@@ -131,7 +136,7 @@ def articulations(ipa: str) -> tuple[Articulation, ...]:
     """
     parts: list[Articulation] = []
     for symbol in unicodedata.normalize("NFD", ipa):
-        if symbol in _VOWELS:
+        if symbol in VOWELS:
             parts.append(_vowel(symbol))
         elif symbol in _CONSONANT_OF:
             parts.append(_consonant(*_CONSONANT_OF[symbol].split()))

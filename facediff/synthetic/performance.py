@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from facediff.synthetic.articulation import SIDED, SPEECH_SHAPES, SpeechSound, blend, lip_contact
+from facediff.synthetic.articulation import LIP_AT_TEETH, SIDED, SPEECH_SHAPES, SpeechSound, blend, lip_contact
 from facediff.synthetic.geometry import Array, rise
 from facediff.synthetic.head.rig import LOOK_DOWN, LOOK_SIDEWAYS, LOOK_UP, SHAPES
 from facediff.synthetic.prosody import ProsodyContours, blurred
@@ -114,13 +114,6 @@ _GAIN_OF = {
     "mouthUpperUp": "lips",
     "mouthLowerDown": "lips",
 }
-
-
-LIP_AT_TEETH = {
-    **{"jawOpen": 0.07, "mouthRollLower": 0.72, "mouthUpperUp": 0.4},
-    **dict.fromkeys(("mouthLowerDown", "mouthFunnel", "mouthPucker", "mouthStretch", "mouthShrugLower"), 0.0),
-}
-"""Weights at which the lower lip lies at the edge of the upper incisors, which are seen."""
 
 
 @dataclass(frozen=True)
