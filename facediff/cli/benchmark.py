@@ -276,13 +276,11 @@ def cost_of_test(cell: Cell, model: Mapping[str, Any], data: SpeechMotionDataMod
     """
     from facediff.models.evaluation import count_generations
 
-    tested = {name.removeprefix("data."): value for name, value in cell.test_options.items()}
-    data = type(data)(**{name: tested.get(name, value) for name, value in data.hparams.items()})
-    tested = {name.removeprefix("model."): value for name, value in cell.test_options.items()}
-    policy, samples = (
-        tested.get(name, model.get(name, usual)) for name, usual in (("unseen_identity", ""), ("test_samples", 1))
-    )
-    steps = tested.get("sampler.steps", model.get("sampler.init_args.steps"))
+    tested = cell.test_options
+    data = type(data)(**{name: tested.get(f"data.{name}", value) for name, value in data.hparams.items()})
+    policy = tested.get("model.unseen_identity", model.get("unseen_identity", ""))
+    samples = tested.get("model.test_samples", model.get("test_samples", 1))
+    steps = tested.get("model.sampler.steps", model.get("sampler.init_args.steps"))
     return number(count_generations(data, policy, samples)) + (f" × {counted(steps, 'step')}" if steps else "")
 
 

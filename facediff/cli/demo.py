@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 CONFIG = "configs/experiment/puppet.yaml"
 COMPARED = 16
 """Clips of each test split on which the new model is compared with the bundled one."""
+SHOWN = {"closure_auc": "closures (AUC)", "open_vowels": "open vowels", "rounding": "rounding"}
+"""Scores of articulation that are printed."""
 SHEET = 12
 """Frames on a contact sheet."""
 FAST = ("--data.drawn_speakers=0", "--trainer.max_epochs=8", "--model.warmup_steps=20")
@@ -91,10 +93,6 @@ def demo(
         tell(f"  {path}")
     tell(*compared)
     tell(f"Next: facediff animate speech.wav --checkpoint {checkpoint} --identity F1 -o speech.mp4")
-
-
-SHOWN = {"closure_auc": "closures (AUC)", "open_vowels": "open vowels", "rounding": "rounding"}
-"""Scores of articulation that are printed."""
 
 
 def write_videos(folder: Path, model: AnimationModel, data: SpeechMotionDataModule) -> list[Path]:
