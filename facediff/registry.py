@@ -241,11 +241,6 @@ corpus = Kind(
     "a data set, as a LightningDataModule",
 )
 metric = Kind("metric", "facediff.metrics", "a score of predicted motion, as a torchmetrics class")
-render_metric = Kind(
-    "render_metric",
-    "facediff.evaluation.renders",
-    "a score of rendered frames and speech by networks of one's own",
-)
 augmentation = Kind("augmentation", "facediff.data.augmentation", "a change of training speech")
 voice_gate = Kind("voice_gate", "facediff.speech.voice_activity", "finds the pauses of speech")
 acting = Kind("acting", "facediff.editing.acting", "moves brows, head and lids with the speech")

@@ -31,7 +31,6 @@ ADDED = {
     ("model", "AutoregressiveTransformer"),
     ("corpus", "ThreeSpeakers"),
     ("metric", "lip_range"),
-    ("render_metric", "brightness"),
     ("augmentation", "reversed"),
     ("voice_gate", "above_level"),
     ("acting", "raised_brows"),

@@ -41,8 +41,6 @@ class ScoreOptions:
         lip_pairs: pairs of inner-lip vertices: a file, or 3531-3504,… (default: the corpus's)
         eyelid_pairs: pairs of eyelid vertices, for blinks, as --lip-pairs
         by: group scores by attributes of clips too: columns of the corpus's clips.csv, such as emotion,intensity
-        render: score renders too, by networks of your own, such as onnx:graph=net.onnx; repeatable
-        mesh: mesh file with the triangles to render (default: the rig's)
         bootstrap: resamples for intervals; 0: none
         level: of the intervals
         seed: of the resamples
@@ -56,8 +54,6 @@ class ScoreOptions:
     lip_pairs: Annotated[str | None, Option(metavar="FILE", reads=True, needs="metric")] = None
     eyelid_pairs: Annotated[str | None, Option(metavar="FILE", reads=True, needs="metric")] = None
     by: Annotated[Sequence[str] | None, Option(metavar="NAME,…")] = None
-    render: Annotated[list[str] | None, Option(metavar="NAME:OPTION=VALUE,…")] = None
-    mesh: Annotated[Path | None, Option(metavar="FILE", reads=True, needs="render")] = None
     bootstrap: Annotated[ranges.Resamples, Option(metavar="N")] = 1000
     level: Annotated[ranges.Level, Option(metavar="P")] = 0.95
     seed: Seed = 0
@@ -84,7 +80,7 @@ class MotionOptions:
     """
 
     templates: File = None
-    frame_rate: Annotated[ranges.FrameRate | None, Option(metavar="F", needs="metric render")] = None
+    frame_rate: Annotated[ranges.FrameRate | None, Option(metavar="F", needs="metric")] = None
     topology: Text = None
     n_vertices: Annotated[ranges.Vertices | None, Option(metavar="V")] = None
     layout: Text = None
@@ -157,7 +153,6 @@ def evaluate(
         files=parameters,
         unit=files.unit,
         file_unit=files.file_unit,
-        renders=scores.render or (),
         identity=files.identity,
         truth_stride=files.truth_stride,
         bootstrap=scores.bootstrap,
@@ -178,12 +173,11 @@ def faces_of(
     scores: ScoreOptions,
     files: MotionOptions,
 ) -> dict[str, Any]:
-    """Regions, pairs, templates and triangles of the face; the corpus's where no option names them."""
+    """Regions, pairs and templates of the face; the corpus's where no option names them."""
     from facediff.data.corpus import read_templates
     from facediff.evaluation import DEFAULT_PATTERNS, TRUTH_PATTERN, read_region
     from facediff.evaluation.evaluator import find_protocols, needs_upper_face
     from facediff.evaluation.file_pairs import count_vertices, read_pairs
-    from facediff.mesh.mesh_files import read_mesh
     from facediff.metrics import EyelidPairs
 
     templates, folder = files.templates, scores.regions
@@ -198,7 +192,6 @@ def faces_of(
     upper_face = None
     if needs_upper_face(find_protocols(scores.protocol or ["paper"], files.topology), scores.metric or []):
         upper_face = regions.get("upper_face") or read_region("upper_face", count, folder=folder, source=upper)
-    faces = None if parameters is None else parameters.faces
     lids = scores.eyelid_pairs
     return {
         "lips": regions.get("lips") or read_region("lips", count, folder=folder, source=lips),
@@ -207,7 +200,6 @@ def faces_of(
         "n_vertices": count,
         "lip_pairs": None if scores.lip_pairs is None else read_pairs(scores.lip_pairs, corpus, count),
         "eyelid_pairs": None if lids is None else read_pairs(lids, corpus, count, EyelidPairs),
-        "faces": faces if scores.mesh is None else read_mesh(scores.mesh).faces,
         "patterns": files.pattern or DEFAULT_PATTERNS,
         "truth_pattern": files.truth_pattern or TRUTH_PATTERN,
     }

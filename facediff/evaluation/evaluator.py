@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -31,7 +29,6 @@ from facediff.evaluation.file_pairs import (
 )
 from facediff.evaluation.groups import attributes_of
 from facediff.evaluation.parameters import ParameterFiles, refuse_vertex_protocols
-from facediff.evaluation.renders import RenderScorer, means, read_render_metrics
 from facediff.evaluation.report import EvaluationReport, MethodTable, runs_of
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
@@ -67,8 +64,6 @@ class EvaluationOptions:
         files: how files of parameters are read; None for files of vertices.
         unit: unit of lengths of the scores of vertices; each protocol's, or the vertices', if None.
         file_unit: unit of the vertices; as the rig or the corpus's ``manifest.json`` says if None.
-        renders: render metrics by name with options; see :mod:`facediff.evaluation.renders`.
-        faces: (F, 3) triangles, of the rendered mesh; the rig's if None.
         patterns: how predictions may be named; see :class:`facediff.evaluation.file_pairs.NamePattern`.
         truth_pattern: how truths are named.
         identity: which predictions of a clip are scored where several were conditioned on different identities:
@@ -98,8 +93,6 @@ class EvaluationOptions:
     files: ParameterFiles | None = None
     unit: str | None = None
     file_unit: str | None = None
-    renders: Sequence[str] = ()
-    faces: npt.NDArray[np.integer] | None = None
     patterns: Sequence[str] = DEFAULT_PATTERNS
     truth_pattern: str = TRUTH_PATTERN
     identity: str = OWN
@@ -113,12 +106,6 @@ class EvaluationOptions:
 
     def __post_init__(self) -> None:
         ranges.check_options(self)
-
-    @property
-    def regions(self) -> dict[str, tuple[int, ...]]:
-        """Vertices of the lips and, if known, of the upper face."""
-        parts = {"lips": self.lips, "upper_face": self.upper_face}
-        return {name: region.indices for name, region in parts.items() if region is not None}
 
     def completed(self, needed: Set[str], *, rate: bool, methods: Mapping[str, str | Path]) -> EvaluationOptions:
         """The options with the corpus's frame rate, if one is needed, and its pairs for metrics."""
@@ -164,7 +151,7 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
     ]
     requests |= {f"{owner}/{label}": request for owner, label, request in of_protocols}
     needed = {need for request in requests.values() for need in request.needs}
-    scoring = scoring.completed(needed, rate=bool(requests or scoring.renders), methods=methods)
+    scoring = scoring.completed(needed, rate=bool(requests), methods=methods)
     suffixes = (".npy",) if scoring.files is None else SUFFIXES
     names, unnamed_truths = list_names(
         Path(truth), [NamePattern(scoring.truth_pattern, scoring.templates or ())], suffixes
@@ -212,7 +199,6 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,
         remarks=scorer.remarks,
-        renders=score_renders(tables, scorer, scoring),
         points="channels" if scoring.files is not None and scoring.files.rig is None else "vertices",
     )
 
@@ -247,40 +233,6 @@ def score_methods(
         MethodTable(method, str(methods[method]), pairs, unscored, scores.get(method, {}), scorer.columns)
         for method, (pairs, unscored) in paired.items()
     ]
-
-
-def score_renders(
-    tables: Sequence[MethodTable], scorer: Scorer, options: EvaluationOptions
-) -> dict[str, dict[str, float]]:
-    """Means over clips of the scores on renders, of every method and of the truth; empty without render metrics."""
-    if not options.renders:
-        return {}
-    metrics = read_render_metrics(options.renders)
-    if options.faces is None or options.frame_rate is None:
-        lacking = "triangles (--mesh FILE)" if options.faces is None else "the frame rate (--frame-rate)"
-        raise FaceDiffError(f"--render draws motion, and lacks {lacking}; give it")
-
-    def speech(clip: str) -> npt.NDArray[np.float32]:
-        path = None if options.corpus is None else find_file(options.corpus / "wav" / f"{clip}.wav")
-        return read_speech(path) if path is not None and path.is_file() else np.zeros(0, np.float32)
-
-    drawing = RenderScorer(
-        metrics=metrics, faces=options.faces, regions=options.regions, frame_rate=options.frame_rate, speech=speech
-    )
-    rows: dict[str, dict[str, dict[str, float]]] = {}
-    for table in tables:
-        for pair, _ in table.rows:
-            truth = scorer.read(pair.truth.path, scorer.truth_stride)
-            vertices = truth.get(channels=False)
-            neutral = scorer.templates.get(pair.truth.name.subject, truth.template)
-            template = (vertices.double().mean(0) if neutral is None else neutral.double()).numpy()
-            clip = name_of_file(pair.truth.path)
-            files = [scorer.read(path, 1).get(channels=False) for path in pair.predictions.values()]
-            scores = [drawing.score(clip, motion.double().numpy(), template) for motion in files]
-            rows.setdefault(table.name, {})[clip] = means(scores)
-            if clip not in rows.setdefault("truth", {}):
-                rows["truth"][clip] = drawing.score(clip, vertices.double().numpy(), template)
-    return {method: means([*clips.values()]) for method, clips in rows.items()}
 
 
 def needs_upper_face(protocols: Sequence[Protocol], metrics: Sequence[str]) -> bool:

@@ -82,11 +82,6 @@ class ParameterFiles:
         return "m" if isinstance(self.rig, Flame) else self.rig.unit if self.rig is not None else ""
 
     @property
-    def faces(self) -> npt.NDArray[np.integer] | None:
-        """The rig's triangles (F, 3)."""
-        return None if self.rig is None else self.rig.faces
-
-    @property
     def n_points(self) -> int:
         """Vertices of the rig, or channels without one."""
         return len(self.space.channels) if self.rig is None else len(self._neutral(self.rig))

@@ -144,7 +144,6 @@ class EvaluationReport:
     unnamed_truths: list[str]  # files among the truths that do not fit the pattern
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
     runs: list[Runs] = field(default_factory=list)  # of methods of which several training runs were given
-    renders: dict[str, dict[str, float]] = field(default_factory=dict)  # means on renders, by method, and the truth
     points: str = "vertices"  # in regions: vertices, or channels where only these are scored
 
     def regions(self) -> dict[str, dict[str, Any]]:
@@ -167,7 +166,6 @@ class EvaluationReport:
             "comparisons": [asdict(comparison) for comparison in self.comparisons],
             "chance": {"sequences": "intervals and stars", "training_runs": "runs" if self.runs else "not known"},
             "runs": [asdict(runs) for runs in self.runs],
-            **({"renders": self.renders} if self.renders else {}),
             "groups": [asdict(group) for group in self.groups],
             "unnamed_truths": self.unnamed_truths,
         }
@@ -369,10 +367,6 @@ def text(report: EvaluationReport) -> str:
             if report.runs
             else "they show the chance between sentences, not the chance between training runs",
         ]
-    if report.renders:
-        names = list(dict.fromkeys(name for scores in report.renders.values() for name in scores))
-        rows = [[who, *(f"{scores[name]:.4e}" for name in names)] for who, scores in report.renders.items()]
-        lines += ["", "on renders, mean over clips", *format_table(["", *names], rows).splitlines()]
     lines += ["", *(_left_out(report) or ["every clip was scored; no frame was cut"])]
     lines = [printable(line) for line in lines]
     for definition in report.protocols.values():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,23 +17,13 @@ BAND = 0.25
 """How far two recordings may be apart in time, as a share of the longer one, after both are stretched to one length."""
 
 
-def mel_filters(
-    n_mels: int, n_fft: int, low: float, high: float, scale: Literal["htk", "slaney"] = "htk"
-) -> npt.NDArray[np.float32]:
-    """Triangular filters (mels, bins) equally spaced on a mel scale, at 16 kHz.
+def mel_filters(n_mels: int, n_fft: int, low: float, high: float) -> npt.NDArray[np.float32]:
+    """Triangular filters (mels, bins) of unit area in Hz, equally spaced in mel, 2595·log10(1 + f/700), at 16 kHz.
 
-    ``htk`` is 2595·log10(1 + f/700) (O'Shaughnessy 1987); ``slaney`` is linear to 1 kHz, 15 mels, and logarithmic
-    above, 27 mels for a factor of 6.4 (Slaney's Auditory Toolbox). Each filter is scaled to unit area in Hz, so that a
-    flat spectrum gives a flat result.
+    The scale is O'Shaughnessy's (1987); a flat spectrum gives a flat result.
     """
-    if scale == "htk":
-        first, last = (2595.0 * math.log10(1.0 + hertz / 700.0) for hertz in (low, high))
-        edges = 700.0 * (10.0 ** (np.linspace(first, last, n_mels + 2) / 2595.0) - 1.0)
-    else:
-        step = math.log(6.4) / 27
-        first, last = (hertz * 3 / 200 if hertz < 1000 else 15 + math.log(hertz / 1000) / step for hertz in (low, high))
-        mels = np.linspace(first, last, n_mels + 2)
-        edges = np.where(mels < 15, mels * 200 / 3, 1000 * np.exp(step * (mels - 15)))
+    first, last = (2595.0 * math.log10(1.0 + hertz / 700.0) for hertz in (low, high))
+    edges = 700.0 * (10.0 ** (np.linspace(first, last, n_mels + 2) / 2595.0) - 1.0)
     bins = np.arange(n_fft // 2 + 1) * (SAMPLE_RATE / n_fft)
     rise = (bins[None] - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
     fall = (edges[2:, None] - bins[None]) / (edges[2:] - edges[1:-1])[:, None]

@@ -1,13 +1,8 @@
 """Metrics of another package, chosen by name in `facediff evaluate` and `facediff test`."""
 
-from collections.abc import Mapping
-
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.evaluation.renders import RenderMetric
 from facediff.metrics import Clip, LipMetric
 
 
@@ -24,16 +19,3 @@ class LipRange(LipMetric):
         """The difference of one sequence."""
         truth, prediction = (motion[:, self.indices].double() for motion in (clip.truth, clip.prediction))
         return torch.stack([(x - x[0]).norm(dim=-1).amax(0).mean() for x in (truth, prediction)]).diff().neg()[0]
-
-
-class Brightness(RenderMetric):
-    """How bright the mouth is in pictures of it, from 0 to 1: a score of renders without any network."""
-
-    part = "mouth"
-    size = (32, 64)
-
-    def score(
-        self, frames: npt.NDArray[np.uint8], speech: npt.NDArray[np.float32], frame_rate: float
-    ) -> Mapping[str, float]:
-        """The mean over pixels and frames."""
-        return {"mean": float(frames.mean() / 255)}
