@@ -2,12 +2,11 @@
 
 A model that is trained on few voices, or on a speech synthesiser, overfits to them. The augmentations change properties
 that facial motion does not depend on: pitch and formants, loudness, the spectrum of a microphone or a telephone, the
-room, noise and hum. Two change the motion as well: :class:`Speed`, and :class:`Pauses`, which teaches that silence
-means a mouth at rest, however loud the noise.
+room, noise and hum.
 
 They are registered under the kind ``augmentation`` and chosen by name with their options::
 
-    --data.augmentations="[voice:semitones=5, room, noise:least=0, pauses]" --data.augmented_share=0.5
+    --data.augmentations="[voice:semitones=5, room, noise:least=0]" --data.augmented_share=0.5
 
 Everything is NumPy and SciPy on whole clips; docs/voices.md lists each with its options.
 """
@@ -17,18 +16,16 @@ from __future__ import annotations
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, cast
+from dataclasses import dataclass
+from typing import Annotated, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.registry import augmentation
 from facediff.speech.audio import fit_length
-from facediff.speech.pitch import SIZE, Wave, shifted, signal, spectra, stretched
+from facediff.speech.pitch import SIZE, Wave, shifted, signal, spectra
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.hints import checks_arguments
-from facediff.utils.numerics import smooth_step
 from facediff.utils.ranges import Range
 
 Share = Annotated[float, Range(0, 1)]
@@ -42,66 +39,20 @@ LIFTER = 30
 PIECE = 10 * SAMPLE_RATE
 """Samples that are encoded together."""
 
-CLOSING, OPENING = 0.2, 0.16
-"""Seconds that a mouth takes to come to rest after speech, and to open before it."""
 
-
-@dataclass(frozen=True)
-class Example:
-    """A training clip, or a window of one.
-
-    Attributes:
-        speech: (S,) at 16 kHz.
-        motion: (T, V, 3) offsets from the template, over the same time.
-        frame_rate: of the motion.
-        rest: (V, 3) the speaker's face in silence.
-        mouth: (V,) which vertices speech moves, 0 to 1; the others keep their motion in a pause.
-    """
-
-    speech: Wave
-    motion: npt.NDArray[np.float32]
-    frame_rate: float
-    rest: npt.NDArray[np.float32]
-    mouth: npt.NDArray[np.float32]
-
-
+@dataclass(kw_only=True)
 class Augmentation(ABC):
-    """One change that is made to a share of the clips.
+    """One change of speech that is made to a share of the clips.
 
     Args:
         share: of the clips that are augmented at all.
     """
 
-    moves: bool = False
-    """Whether it changes the number of frames, so that windows and pairs of clips no longer fit the corpus's frames."""
-
-    def __init__(self, *, share: Share = 0.5) -> None:
-        self.share = share
-
-    def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
-        """Let every constructor refuse options that are out of range."""
-        super().__init_subclass__(**options)
-        if "__init__" in vars(cls):
-            cls.__init__ = checks_arguments(cls.__init__, "data.augmentations")  # type: ignore[method-assign]
-
-    @abstractmethod
-    def __call__(self, example: Example, random: np.random.Generator) -> Example:
-        """The changed clip; its speech has as many samples as its frames last."""
-
-
-class SpeechAugmentation(Augmentation):
-    """An augmentation that changes the speech alone."""
-
-    def __call__(self, example: Example, random: np.random.Generator) -> Example:
-        """The clip with other speech of the same length."""
-        if not example.speech.any():
-            return example
-        changed = fit_length(np.asarray(self.change(example.speech, random), np.float32), len(example.speech))
-        return replace(example, speech=changed)
+    share: Share = 0.5
 
     @abstractmethod
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
-        """Changed speech (S',), in time with ``speech``; it is cut or padded to the same length afterwards."""
+        """Changed speech (S',), in time with ``speech`` (S,) at 16 kHz; it is cut or padded to S afterwards."""
 
 
 class Augmenter:
@@ -116,26 +67,16 @@ class Augmenter:
         self.augmentations = list(augmentations)
         self.share = share
 
-    @property
-    def speech_only(self) -> bool:
-        """Whether all augmentations leave the motion as it is, in whatever form it comes."""
-        return all(isinstance(change, SpeechAugmentation) for change in self.augmentations)
-
-    def change_speech(self, speech: Wave, seed: int) -> npt.NDArray[np.float32]:
-        """Speech (S,) as augmentations of speech alone change it, with a motion or without one."""
-        nothing = np.zeros((1, 0), np.float32)
-        return self(Example(speech, nothing, 1.0, nothing[0], nothing[0]), seed).speech
-
-    def __call__(self, example: Example, seed: int) -> Example:
-        """The clip as these augmentations change it; the same seed changes it in the same way."""
+    def __call__(self, speech: Wave, seed: int) -> Wave:
+        """Speech (S,) as these augmentations change it; the same seed changes it in the same way."""
         random = np.random.default_rng(seed)
         if random.random() >= self.share:
-            return example
+            return speech
         for change in self.augmentations:
-            if random.random() < change.share:
-                example = change(example, random)
-        peak = float(np.abs(example.speech).max(initial=0))
-        return replace(example, speech=example.speech / peak) if peak > 1 else example
+            if random.random() < change.share and speech.any():
+                speech = fit_length(np.asarray(change.change(speech, random), np.float32), len(speech))
+        peak = float(np.abs(speech).max(initial=0))
+        return speech / peak if peak > 1 else speech
 
 
 def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
@@ -153,7 +94,8 @@ def read_augmentations(texts: Sequence[str]) -> list[Augmentation]:
 
 
 @augmentation.register("voice")
-class Voice(SpeechAugmentation):
+@dataclass(kw_only=True)
+class Voice(Augmentation):
     """Another speaker's pitch and formants, each by a random amount or both by the same.
 
     The pitch is shifted by overlapping grains of the waveform and resampling, the spectral envelope is warped along
@@ -168,16 +110,10 @@ class Voice(SpeechAugmentation):
         together: share of the changes in which the formants move with the pitch, by up to ``semitones``.
     """
 
-    def __init__(
-        self,
-        *,
-        share: Share = 0.7,
-        semitones: Annotated[float, Range(0, 24)] = 5.0,
-        formants: Annotated[float, Range(0, 0.6)] = 0.2,
-        together: Share = 0.0,
-    ) -> None:
-        super().__init__(share=share)
-        self.semitones, self.formants, self.together = semitones, formants, together
+    share: Share = 0.7
+    semitones: Annotated[float, Range(0, 24)] = 5.0
+    formants: Annotated[float, Range(0, 0.6)] = 0.2
+    together: Share = 0.0
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Shift pitch and formants."""
@@ -193,41 +129,12 @@ class Voice(SpeechAugmentation):
         return warped(speech, warp / pitch)
 
 
-@augmentation.register("speed")
-class Speed(Augmentation):
-    """Faster or slower speech of the same pitch, and the motion with it.
-
-    Args:
-        share: of the augmented clips.
-        ratio: largest change of the speed, faster or slower, as a share.
-    """
-
-    moves = True
-
-    def __init__(self, *, share: Share = 0.3, ratio: Annotated[float, Range(0, 0.5)] = 0.15) -> None:
-        super().__init__(share=share)
-        self.ratio = ratio
-
-    def __call__(self, example: Example, random: np.random.Generator) -> Example:
-        """The clip with another number of frames."""
-        before = len(example.motion)
-        after = max(2, round(before / (1 + self.ratio) ** random.uniform(-1, 1)))
-        if before < 2 or after == before:
-            return example
-        positions = (np.arange(after) + 0.5) * (before / after) - 0.5
-        low = np.clip(np.floor(positions).astype(int), 0, before - 2)
-        share = np.clip(positions - low, 0.0, 1.0).astype(np.float32)[:, None, None]
-        motion = (1 - share) * example.motion[low] + share * example.motion[low + 1]
-        length = round(after * SAMPLE_RATE / example.frame_rate)
-        speech = stretched(example.speech, length / max(1, len(example.speech)))
-        return replace(example, motion=motion, speech=fit_length(speech, length))
-
-
 # Level and spectrum.
 
 
 @augmentation.register("loudness")
-class Loudness(SpeechAugmentation):
+@dataclass(kw_only=True)
+class Loudness(Augmentation):
     """Loudness that drifts, as if the speaker turned away from the microphone.
 
     Args:
@@ -235,9 +142,8 @@ class Loudness(SpeechAugmentation):
         decibels: most by which it differs from the mean, in either direction.
     """
 
-    def __init__(self, *, share: Share = 0.5, decibels: Decibels = 6.0) -> None:
-        super().__init__(share=share)
-        self.decibels = decibels
+    share: Share = 0.5
+    decibels: Decibels = 6.0
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Multiply by a smooth gain."""
@@ -248,7 +154,8 @@ class Loudness(SpeechAugmentation):
 
 
 @augmentation.register("tilt")
-class Tilt(SpeechAugmentation):
+@dataclass(kw_only=True)
+class Tilt(Augmentation):
     """Another balance of low and high frequencies: a linear tilt, and a smooth curve over it.
 
     Args:
@@ -257,9 +164,9 @@ class Tilt(SpeechAugmentation):
         curve: largest gain of the curve in either direction.
     """
 
-    def __init__(self, *, share: Share = 0.5, decibels: Decibels = 4.0, curve: Decibels = 6.0) -> None:
-        super().__init__(share=share)
-        self.decibels, self.curve = decibels, curve
+    share: Share = 0.5
+    decibels: Decibels = 4.0
+    curve: Decibels = 6.0
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Filter without delay."""
@@ -271,7 +178,8 @@ class Tilt(SpeechAugmentation):
 
 
 @augmentation.register("band")
-class Band(SpeechAugmentation):
+@dataclass(kw_only=True)
+class Band(Augmentation):
     """A limited band of the spectrum, as of small microphones and telephones.
 
     Args:
@@ -280,15 +188,9 @@ class Band(SpeechAugmentation):
         high: everything above a random frequency is lost; the lowest it may be, in Hz.
     """
 
-    def __init__(
-        self,
-        *,
-        share: Share = 0.3,
-        low: Annotated[float, Range(0, 2000)] = 300.0,
-        high: Annotated[float, Range(500, 8000)] = 3000.0,
-    ) -> None:
-        super().__init__(share=share)
-        self.low, self.high = low, high
+    share: Share = 0.3
+    low: Annotated[float, Range(0, 2000)] = 300.0
+    high: Annotated[float, Range(500, 8000)] = 3000.0
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Filter by edges that fall by 24 dB an octave."""
@@ -303,29 +205,27 @@ class Band(SpeechAugmentation):
 
 
 @augmentation.register("codec")
-class Codec(SpeechAugmentation):
+@dataclass(kw_only=True)
+class Codec(Augmentation):
     """Lossy compression: a telephone's 8 bits at 8 kHz, or Vorbis at a low rate.
 
     Args:
         share: of the augmented clips.
-        kind: ``telephone`` (mu-law, ITU-T G.711), ``vorbis``, or ``any`` of them.
     """
 
-    def __init__(self, *, share: Share = 0.15, kind: Literal["any", "telephone", "vorbis"] = "any") -> None:
-        super().__init__(share=share)
-        self.kind = kind
+    share: Share = 0.15
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Encode and decode."""
-        kind = ("telephone", "vorbis")[int(random.integers(2))] if self.kind == "any" else self.kind
-        return telephone(speech) if kind == "telephone" else vorbis(speech, float(random.uniform(0.5, 1.0)))
+        return vorbis(speech, float(random.uniform(0.5, 1.0))) if random.integers(2) else telephone(speech)
 
 
 # Rooms and noise.
 
 
 @augmentation.register("room")
-class Room(SpeechAugmentation):
+@dataclass(kw_only=True)
+class Room(Augmentation):
     """A room: the direct sound, and noise that decays exponentially after it (Moorer 1979).
 
     Args:
@@ -334,15 +234,9 @@ class Room(SpeechAugmentation):
         direct: least ratio of direct to reverberant sound, in decibels.
     """
 
-    def __init__(
-        self,
-        *,
-        share: Share = 0.4,
-        seconds: Annotated[float, Range(0.05, 5)] = 0.6,
-        direct: Annotated[float, Range(-20, 60)] = 0.0,
-    ) -> None:
-        super().__init__(share=share)
-        self.seconds, self.direct = seconds, direct
+    share: Share = 0.4
+    seconds: Annotated[float, Range(0.05, 5)] = 0.6
+    direct: Annotated[float, Range(-20, 60)] = 0.0
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Convolve with a random impulse response without delay: the direct sound comes at time 0."""
@@ -361,7 +255,8 @@ class Room(SpeechAugmentation):
         return cast(Wave, fftconvolve(speech, tail.astype(np.float32))[: len(speech)])
 
 
-class Background(SpeechAugmentation):
+@dataclass(kw_only=True)
+class Background(Augmentation):
     """A sound that is added to the speech, at a random ratio of the two.
 
     Args:
@@ -370,14 +265,14 @@ class Background(SpeechAugmentation):
         most: largest ratio.
     """
 
-    def __init__(self, *, share: Share, least: Ratio, most: Ratio) -> None:
-        super().__init__(share=share)
-        self.least, self.most = least, max(least, most)
+    share: Share
+    least: Ratio
+    most: Ratio
 
     def change(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Add the sound."""
         sound = self.sound(speech, random)
-        return speech + sound * gain_for(speech, sound, random.uniform(self.least, self.most))
+        return speech + sound * gain_for(speech, sound, random.uniform(self.least, max(self.least, self.most)))
 
     @abstractmethod
     def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
@@ -385,6 +280,7 @@ class Background(SpeechAugmentation):
 
 
 @augmentation.register("noise")
+@dataclass(kw_only=True)
 class Noise(Background):
     """Noise of a random colour, from white to brown, and of a level that may change slowly.
 
@@ -394,8 +290,9 @@ class Noise(Background):
         most: largest ratio.
     """
 
-    def __init__(self, *, share: Share = 0.6, least: Ratio = 5.0, most: Ratio = 50.0) -> None:
-        super().__init__(share=share, least=least, most=most)
+    share: Share = 0.6
+    least: Ratio = 5.0
+    most: Ratio = 50.0
 
     def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Noise of one colour."""
@@ -404,6 +301,7 @@ class Noise(Background):
 
 
 @augmentation.register("hum")
+@dataclass(kw_only=True)
 class Hum(Background):
     """Mains hum: 50 or 60 Hz with its harmonics.
 
@@ -413,8 +311,9 @@ class Hum(Background):
         most: largest ratio.
     """
 
-    def __init__(self, *, share: Share = 0.2, least: Ratio = 10.0, most: Ratio = 50.0) -> None:
-        super().__init__(share=share, least=least, most=most)
+    share: Share = 0.2
+    least: Ratio = 10.0
+    most: Ratio = 50.0
 
     def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Hum of one frequency."""
@@ -430,6 +329,7 @@ class Hum(Background):
 
 
 @augmentation.register("babble")
+@dataclass(kw_only=True)
 class Babble(Background):
     """Other people who talk in the background.
 
@@ -443,16 +343,10 @@ class Babble(Background):
         voices: most people.
     """
 
-    def __init__(
-        self,
-        *,
-        share: Share = 0.25,
-        least: Ratio = 6.0,
-        most: Ratio = 30.0,
-        voices: Annotated[int, Range(1, 20)] = 8,
-    ) -> None:
-        super().__init__(share=share, least=least, most=most)
-        self.voices = voices
+    share: Share = 0.25
+    least: Ratio = 6.0
+    most: Ratio = 30.0
+    voices: Annotated[int, Range(1, 20)] = 8
 
     def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Babble of some people."""
@@ -468,6 +362,7 @@ class Babble(Background):
 
 
 @augmentation.register("music")
+@dataclass(kw_only=True)
 class Music(Background):
     """Music in the background: chords of decaying partials, and often a drum.
 
@@ -477,55 +372,13 @@ class Music(Background):
         most: largest ratio.
     """
 
-    def __init__(self, *, share: Share = 0.25, least: Ratio = 6.0, most: Ratio = 30.0) -> None:
-        super().__init__(share=share, least=least, most=most)
+    share: Share = 0.25
+    least: Ratio = 6.0
+    most: Ratio = 30.0
 
     def sound(self, speech: Wave, random: np.random.Generator) -> npt.NDArray[np.floating]:
         """Music as long as the speech."""
         return played(len(speech), random)
-
-
-@augmentation.register("pauses")
-class Pauses(Augmentation):
-    """Silence for a while, or in the whole clip, during which the mouth comes to rest.
-
-    Put it before rooms, noise and hum, so that these go on in the pause. The rest of the face keeps its motion.
-
-    Args:
-        share: of the augmented clips.
-        seconds: longest pause.
-        silent: share of the changed clips that become silent as a whole, but for noise where ``noise`` follows.
-    """
-
-    def __init__(
-        self, *, share: Share = 0.4, seconds: Annotated[float, Range(0.3, 60)] = 1.2, silent: Share = 0.15
-    ) -> None:
-        super().__init__(share=share)
-        self.seconds, self.silent = seconds, silent
-
-    def __call__(self, example: Example, random: np.random.Generator) -> Example:
-        """The clip with a pause."""
-        frames, rate = len(example.motion), example.frame_rate
-        silent_clip = random.random() < self.silent
-        length = min(random.uniform(0.3, self.seconds), 0.7 * frames / rate)
-        # Often at either end of the clip: where speech begins out of silence is where onsets are learnt.
-        start = float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (frames / rate - length)
-        first, last = (-1e9, 1e9) if silent_clip else (start, start + length)
-        if start <= 0:
-            first = -1e9
-        elif start >= frames / rate - length:
-            last = 1e9
-        middles = (np.arange(frames) + 0.5) / rate
-        closing, opening = smooth_step((middles - first) / CLOSING), smooth_step((last - middles) / OPENING)
-        at_rest = np.minimum(closing, opening).astype(np.float32)
-        weight = at_rest[:, None, None] * example.mouth[None, :, None]
-        motion = example.motion + weight * (example.rest - example.motion)
-        times = np.arange(len(example.speech)) / SAMPLE_RATE
-        gain = 1 - np.clip(np.minimum((times - first) / 0.02, (last - times) / 0.02), 0, 1)
-        # Faint and not zero: `noise` and `hum` scale with the power of the speech and would vanish otherwise.
-        faint = 10 ** (-random.uniform(50, 90) / 20) * random.standard_normal(len(times))
-        speech = example.speech * gain + faint * float(np.abs(example.speech).max(initial=0))
-        return replace(example, motion=motion, speech=speech.astype(np.float32))
 
 
 # Signal processing.

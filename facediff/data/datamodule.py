@@ -476,6 +476,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             clips = self._with_reference(clips, policy)
         elif not training or self.reference != "self":
             policy.check(clips)
+        if training and self.augmenter and self.features.reader is not None:
+            raise FaceDiffError("data.augmentations: cached speech features are not augmented; omit one of them")
         if training and self.augmenter and clips and not any(clip.fits(self.augmented_clips) for clip in clips):
             raise FaceDiffError(
                 f"data.augmented_clips: {self.augmented_clips} fits none of the {len(clips)} clips; expected "
@@ -495,10 +497,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             aligner=self.aligner if training and self.pair_sentences else None,
             augmenter=self.augmenter if training else None,
             augmented_clips=self.augmented_clips,
-            mouth=self._mouth() if training and self.augmenter is not None else None,
-            projection=self.projection
-            if training and (self.augmenter is None or self.augmenter.speech_only)
-            else ProjectionSlot(),
+            projection=self.projection if training else ProjectionSlot(),
         )
 
     def _with_reference(self, clips: list[Clip], policy: ReferencePolicy) -> list[Clip]:
@@ -509,23 +508,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         if alone:
             print(f"{self.corpus_name}: left out of the test, being their speakers' only clips: {', '.join(alone)}")
         return [clip for clip in clips if clip.name not in alone]
-
-    def _mouth(self) -> npt.NDArray[np.float32]:
-        """Mask of the vertices that speech moves (V,): 1 for all but the upper face."""
-        fault = "cached speech features are not augmented" if self.features.reader is not None else ""
-        moves = any(change.moves for change in (self.augmenter.augmentations if self.augmenter else []))
-        if moves and (self.window is not None or self.pair_sentences):
-            fault = "speed changes the number of frames, which windows and pairs of clips rely on"
-        if fault:
-            raise FaceDiffError(f"data.augmentations: {fault}; omit the augmentations, or the cache, windows and pairs")
-        mouth = np.ones(self.n_vertices, np.float32)
-        if self.space.is_vertices:
-            sources = self.regions["upper_face"]
-            upper = find_region(self.root, sources, "upper_face", self.n_vertices, self.region_help).tensor()
-        else:
-            upper = channel_regions(self.space)["upper_face"]
-        mouth[upper.numpy()] = 0
-        return mouth
 
     def assets(self) -> Assets:
         """The part of a checkpoint that describes this corpus, still without :meth:`motion_scale`."""

@@ -10,12 +10,11 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from facediff.data.augmentation import Augmenter, Example
+from facediff.data.augmentation import Augmenter
 from facediff.data.batch import UNKNOWN_IDENTITY, Sample
 from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
@@ -381,7 +380,6 @@ class MotionDataset(Dataset[Sample]):
         aligner: lets the windows of two clips that say the same begin at the same sound; None leaves them to chance.
         augmenter: changes training speech; None leaves it as it was recorded.
         augmented_clips: patterns of attributes, of which the augmenter changes only clips that fit them.
-        mouth: which vertices speech moves (V,), 0 to 1; needed with an augmenter.
         projection: may make components (T, K) of motion (T, V, 3), which are kept in memory.
     """
 
@@ -399,7 +397,6 @@ class MotionDataset(Dataset[Sample]):
     aligner: Aligner | None = None
     augmenter: Augmenter | None = None
     augmented_clips: Mapping[str, str] = field(default_factory=dict)
-    mouth: npt.NDArray[np.float32] | None = None
     projection: ProjectionSlot = field(default_factory=ProjectionSlot)
     _alignments: dict[tuple[int, int], Tensor] = field(default_factory=dict)
 
@@ -430,7 +427,7 @@ class MotionDataset(Dataset[Sample]):
         audio = self.corpus.read_audio(clip, first, last)
         motion = self.projection.read(self.corpus, clip, first, last)
         if self.augmenter is not None and clip.fits(self.augmented_clips):
-            audio, motion = self._augmented(self.augmenter, clip, audio, motion, pick.seed)
+            audio = torch.from_numpy(self.augmenter(audio.numpy(), pick.seed))
         return Sample(
             audio=audio,
             motion=motion,
@@ -446,21 +443,6 @@ class MotionDataset(Dataset[Sample]):
             repeated=pick.repeated,
             window=(start - first, stop - first) if any(self.context) else None,
         )
-
-    def _augmented(
-        self, augmenter: Augmenter, clip: Clip, audio: Tensor, motion: Tensor, seed: int
-    ) -> tuple[Tensor, Tensor]:
-        """Speech (samples,) and motion (frames, V, 3) as the augmenter changes them."""
-        if augmenter.speech_only:  # whatever form the motion has
-            return torch.from_numpy(augmenter.change_speech(audio.numpy(), seed)), motion
-        frames = self.corpus.frames(clip)
-        # A recording begins and ends without speech: of its two ends, the one nearer to the neutral face.
-        mouth = np.ones(len(motion[0]), np.float32) if self.mouth is None else self.mouth
-        ends = [self.corpus.read_motion(clip, frame, frame + 1)[0].numpy() for frame in (0, frames - 1)]
-        rest = min(ends, key=lambda face: float(np.square(face[mouth > 0]).sum()))
-        example = Example(audio.numpy(), motion.numpy(), self.corpus.frame_rate, rest, mouth)
-        changed = augmenter(example, seed)
-        return torch.from_numpy(changed.speech), torch.from_numpy(changed.motion)
 
     def says(self, index: int) -> str:
         """The text of a clip, or its sentence: clips for which it is equal have the same words and can be aligned."""

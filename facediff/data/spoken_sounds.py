@@ -95,8 +95,7 @@ class SpokenSounds:
 
     def __init__(self, recordings: Path, data: SpeechMotionDataModule) -> None:
         self.frame_rate = data.frame_rate
-        augmenter = data.augmenter
-        self.augmenter = augmenter if augmenter is not None and augmenter.speech_only else None
+        self.augmenter = data.augmenter
         self.people: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]] = []
         for speaker in speakers_of(recordings):
             for recording in recordings_of(speaker, MOST):
@@ -148,4 +147,4 @@ class SpokenSounds:
     def _augmented(self, speech: Tensor, seed: int) -> Tensor:
         if self.augmenter is None:
             return speech
-        return torch.from_numpy(self.augmenter.change_speech(speech.numpy(), seed))
+        return torch.from_numpy(self.augmenter(speech.numpy(), seed))

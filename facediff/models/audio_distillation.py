@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
-from facediff.data.augmentation import Augmenter, SpeechAugmentation, read_augmentations
+from facediff.data.augmentation import Augmenter, read_augmentations
 from facediff.errors import FaceDiffError, OptionError, refuse_idle
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
@@ -171,13 +171,6 @@ def distil_audio_encoder(
         the remaining error of the student's features, as a share of the teacher features' variance: the mean of the
         last tenth of the steps.
     """
-    augmentations = read_augmentations(options.augmentations)
-    # The teacher's features of the clean recording are the target: its frames must stay where they are.
-    if moving := [change for change in augmentations if not isinstance(change, SpeechAugmentation)]:
-        raise FaceDiffError(
-            f"augmentations: {type(moving[0]).__name__.lower()} changes the timing of the speech, so the teacher has "
-            f"no features to compare with; omit it"
-        )
     student = model.speech_encoder
     weights = [weight for weight in student.parameters() if weight.requires_grad]
     if not weights:
@@ -191,7 +184,7 @@ def distil_audio_encoder(
             model.choose_low_latency()
         windows = model.windows
     recordings = [] if options.people is None else read_recordings(options.people, options.seed)
-    pairs = SpeechPairs(data, Augmenter(augmentations), options, windows, recordings)
+    pairs = SpeechPairs(data, Augmenter(read_augmentations(options.augmentations)), options, windows, recordings)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
     optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
@@ -367,7 +360,7 @@ class SpeechPairs(Dataset[DistillationBatch]):
 
     def _augmented(self, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
         """Speech of the same length in another voice, another room or with noise."""
-        return self.augmenter.change_speech(speech, int(random.integers(2**31)))
+        return self.augmenter(speech, int(random.integers(2**31)))
 
 
 def read_recordings(folder: Path, seed: int) -> list[npt.NDArray[np.float32]]:

@@ -103,9 +103,6 @@ def test_the_seed_decides_whatever_process_changes_speech(
 
 
 def test_what_cannot_be_learnt_is_refused(model: AnimationModel, tiny: Tiny) -> None:
-    for name in ("speed", "pauses"):
-        with pytest.raises(FaceDiffError, match=name):
-            distil_audio_encoder(model, tiny, replace(FEW, augmentations=["noise", name]))
     with pytest.raises(FaceDiffError, match='no augmentation "voices"'):
         distil_audio_encoder(model, tiny, replace(FEW, augmentations=["voices"]))
     model.speech_encoder.requires_grad_(False)

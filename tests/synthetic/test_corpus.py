@@ -12,7 +12,7 @@ import pytest
 
 from facediff.data import Puppet
 from facediff.data.batch import DATA_SOURCE_KEY
-from facediff.data.check import check, text, truth
+from facediff.data.check import check, text
 from facediff.data.packed.packing import pack
 from facediff.data.puppet import PuppetMask
 from facediff.data.storage import ClipFolder, WeightFile
@@ -85,46 +85,11 @@ def test_vertices_are_what_weights_decode_to(corpus: Path) -> None:
     assert rig.shape == (1 + len(SHAPES), len(build_head().vertices), 3)
 
 
-def test_what_a_small_corpus_lacks_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    random = np.random.default_rng(0)
-    still = {name: random.normal(size=(9, 2, 3)) for name in ("lips", "upper_face")}
-    weights = {name: random.uniform(size=9) for name in ("eyeBlinkLeft", "jawOpen")}
-    clip = truth.TruthClip(weights, np.zeros((9, 2)), np.zeros((9, 3)), still, [])
-    one = {name: values[:1] for name, values in weights.items()}
-    short = truth.TruthClip(one, np.zeros((1, 2)), np.zeros((1, 3)), {k: v[:1] for k, v in still.items()}, [])
-    monkeypatch.setattr(truth, "_read", lambda *_: iter([clip, short]))
-    for part in ("weights", "gaze", "head"):
-        (tmp_path / f"{part}_npy").mkdir()
-    values = {row["measure"]: row["value"] for row in truth.measure_truth(tmp_path, ["a"], 25.0)}
-    assert values["lips apart at p, b, m, 95th percentile, mm"] == "none"
-    assert values["glances above 4°, mean size, °"] == "none"
-
-
-def test_the_check_reads_weights_and_measures_the_truth(corpus: Path) -> None:
+def test_the_check_reads_weights(corpus: Path) -> None:
     report = check(corpus)
     assert report.sound, text(report)
     assert report.n_vertices == len(build_head().vertices)
     assert {row["split"]: row["present"] for row in report.splits} == {"train": 1, "test_a": 1, "test_b": 1}
-    values = {row["measure"]: row["value"] for row in report.truth}
-    frames, blinks = 0, 0
-    for name in ONLY:
-        shut = np.load(corpus / "weights_npy" / f"{name}.npy")[:, SHAPES.index("eyeBlinkLeft")] > 0.5
-        frames, blinks = frames + len(shut), blinks + int((np.diff(shut.astype(int)) == 1).sum())
-    assert float(values["blinks a minute"]) == pytest.approx(blinks / (frames / 1500), abs=0.06)
-    assert float(values["lips apart at p, b, m, 95th percentile, mm"]) < 2
-    assert "how the truth moves" in text(report)
-
-
-def test_frequencies_and_jumps_are_measured() -> None:
-    times = np.arange(500) / 25.0
-    waves = [np.sin(2 * np.pi * 3.0 * times), np.sin(2 * np.pi * 3.0 * times + 1.0)]
-    assert truth._median_frequency(waves, 25.0) == pytest.approx(3.0, abs=0.1)
-    two = np.sin(2 * np.pi * 3.0 * times) + 0.5 * np.sin(2 * np.pi * 10.0 * times)
-    assert truth._share_above([two[:, None, None]], 25.0, 8.0) == pytest.approx(0.2, abs=0.01)  # 0.25 of 1.25
-    gaze = np.zeros((20, 2))
-    gaze[5:] += [3.0, 4.0]
-    gaze[12:] -= [6.0, 0.0]
-    assert truth._jumps(gaze, 25.0) == pytest.approx([5.0, 6.0])
 
 
 def test_the_data_module_decodes_weights(corpus: Path) -> None:

@@ -36,9 +36,7 @@ from facediff.data.check.shared import (
     check_regions,
     check_templates,
 )
-from facediff.data.check.truth import measure_truth
 from facediff.data.packed.stores import is_packed
-from facediff.data.storage import WEIGHTS_FOLDER
 from facediff.errors import FaceDiffError, counted, number
 from facediff.utils.jobs import is_cluster, run_tasks
 from facediff.utils.workers import WorkerDied, processors
@@ -183,9 +181,6 @@ def _check_corpus(
     frames = {clip.name: -(-clip.frames // stride) for clip in facts if clip.frames is not None}
     report.splits = _count_splits(view, clips, frames, findings)
     report.subjects = _count_subjects(view, clips, frames, templates)
-    if view.corpus == "puppet" and not report.quick:
-        with findings.guard("truth_unreadable", root / WEIGHTS_FOLDER, root):
-            report.truth = measure_truth(root, clips, stored)
 
 
 def _clips(opened: Corpus | None, view: CorpusView, folder: CorpusFolder, findings: Findings) -> dict[str, Clip]:

@@ -86,8 +86,6 @@ class CheckReport:
     regions: dict[str, dict[str, Any] | None] = field(default_factory=dict)
     # there, ended (whether preparation has ended), facediff (version that wrote it), changed, missing
     manifest: dict[str, Any] = field(default_factory=dict)
-    # of the built-in corpus, how its truth moves: measure, value, people (in people), source
-    truth: list[dict[str, str]] = field(default_factory=list)
 
     @property
     def sound(self) -> bool:
@@ -131,10 +129,6 @@ def text(report: CheckReport) -> str:
         blocks.append(_subjects(report))
     if report.corpus is not None and report.points == "vertices":
         blocks.append(_shared_files(report))
-    if report.truth:
-        columns = ["measure", "value", "people", "source"]
-        rows = [[row[column] for column in columns] for row in report.truth]
-        blocks.append(format_table(["how the truth moves", "corpus", "people", "source"], rows, left=4))
     groups: dict[tuple[str, str], list[Finding]] = {}
     for finding in report.findings:
         groups.setdefault((finding.severity, finding.kind), []).append(finding)

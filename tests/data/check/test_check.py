@@ -42,7 +42,6 @@ def test_the_json_object_is_complete(copies: Path, capsys: pytest.CaptureFixture
     assert set(report) == {
         *("format", "root", "quick", "corpus", "data_module", "sound", "frame_rate", "stored_frame_rate"),
         *("n_vertices", "points", "findings", "splits", "subjects", "templates", "mesh", "regions", "manifest"),
-        "truth",
     }
     (finding,) = report["findings"]
     assert finding["severity"] == "warning"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.augmentation import SpeechAugmentation
+from facediff.data.augmentation import Augmentation
 from facediff.editing.acting import Acting, Performer
 from facediff.live import Address, LiveFrame, Performance, Receiver
 from facediff.speech.espeak import SpokenPhoneme, Utterance
@@ -13,7 +13,7 @@ from facediff.speech.voice_activity import Listener, VoiceGate
 from facediff.synthetic.voices import Delivery, Synthesiser
 
 
-class Reversed(SpeechAugmentation):
+class Reversed(Augmentation):
     """The other sign of every sample, as from a microphone that is wired the other way round."""
 
     def change(self, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.floating]:
