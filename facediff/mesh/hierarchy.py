@@ -1,28 +1,18 @@
-"""A mesh, the same mesh with fewer and fewer vertices, and the maps between them: made once per topology and cached."""
+"""A mesh, the same mesh with fewer and fewer vertices, and the maps from each to the next."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, damaged, needs_extra
-from facediff.mesh.mesh import Array, closest_on_triangles
+from facediff.errors import needs_extra
+from facediff.mesh.mesh import Array
 from facediff.mesh.spirals import Indices, Points, checked_faces, spirals
-from facediff.utils.arrays import read_arrays
-from facediff.utils.files import atomic, cache_dir
 
 Pooling = Literal["select", "mean"]
-
-VERSION = 1  # Part of every key in the cache; to be raised whenever equal input gives another result
 
 
 @dataclass(frozen=True)
@@ -50,14 +40,12 @@ class MeshLevel:
         faces: (F, 3) vertex indices.
         spirals: (n_vertices, length) every vertex and those around it.
         down: map to the next, coarser level; None at the coarsest.
-        up: map from the next level to this one; None at the coarsest.
     """
 
     n_vertices: int
     faces: Indices
     spirals: Indices
     down: Operator | None
-    up: Operator | None
 
 
 @dataclass(frozen=True)
@@ -65,63 +53,10 @@ class MeshHierarchy:
     """A mesh at several resolutions.
 
     Attributes:
-        n_vertices: vertices of the whole template.
-        vertices: the template's vertices of the finest level, ascending; None if it has all of them.
         levels: finest first; one more than the number of down-samplings.
     """
 
-    n_vertices: int
-    vertices: Indices | None
     levels: tuple[MeshLevel, ...]
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """All of it as named plain arrays, from which :meth:`from_arrays` makes an equal one."""
-        arrays: dict[str, npt.NDArray[Any]] = {"n_vertices": np.array(self.n_vertices)}
-        if self.vertices is not None:
-            arrays["vertices"] = self.vertices.astype(np.int32)
-        for number, level in enumerate(self.levels):
-            arrays[f"{number}.faces"] = level.faces.astype(np.int32)
-            arrays[f"{number}.spirals"] = level.spirals.astype(np.int32)
-            for name, operator in (("down", level.down), ("up", level.up)):
-                if operator is not None:
-                    arrays[f"{number}.{name}.rows"] = operator.rows.astype(np.int32)
-                    arrays[f"{number}.{name}.columns"] = operator.columns.astype(np.int32)
-                    arrays[f"{number}.{name}.weights"] = operator.weights
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, content: Mapping[str, npt.ArrayLike]) -> MeshHierarchy:
-        """The hierarchy that :meth:`arrays` described."""
-        with damaged("mesh hierarchy", "compute it again from the template"):
-            arrays = {name: np.asarray(array) for name, array in content.items()}
-            sizes: list[int] = []
-            while f"{len(sizes)}.spirals" in arrays:
-                sizes.append(len(arrays[f"{len(sizes)}.spirals"]))
-            levels = tuple(_level(arrays, number, sizes) for number in range(len(sizes)))
-            vertices = arrays["vertices"].astype(np.int64) if "vertices" in arrays else None
-            n_vertices = int(arrays["n_vertices"])
-            if not levels or sizes[0] != (n_vertices if vertices is None else len(vertices)):
-                raise ValueError("its levels do not match its vertices")
-        return cls(n_vertices, vertices, levels)
-
-
-def _level(arrays: Mapping[str, npt.NDArray[Any]], number: int, sizes: list[int]) -> MeshLevel:
-    def within(name: str, size: int, dimensions: int) -> Indices:
-        index = arrays[f"{number}.{name}"]
-        if index.ndim != dimensions or (index.size and not (index.min() >= 0 and index.max() < size)):
-            raise ValueError(f"{number}.{name} holds an index out of range")
-        return index.astype(np.int64)
-
-    def operator(name: str, rows: int, columns: int) -> Operator:
-        row, column = within(f"{name}.rows", rows, 1), within(f"{name}.columns", columns, 1)
-        weights = arrays[f"{number}.{name}.weights"].astype(np.float32)
-        return Operator(row, column.reshape(row.shape), weights.reshape(row.shape), (rows, columns))
-
-    size, coarse = sizes[number], (*sizes, 0)[number + 1]
-    table, faces = within("spirals", size, 2), within("faces", size, 2)
-    if not coarse:
-        return MeshLevel(size, faces, table, None, None)
-    return MeshLevel(size, faces, table, operator("down", coarse, size), operator("up", size, coarse))
 
 
 def mesh_hierarchy(
@@ -132,70 +67,34 @@ def mesh_hierarchy(
     spiral_length: int = 12,
     dilation: int = 1,
     pooling: Pooling = "select",
-    vertices: npt.NDArray[np.integer] | None = None,
-    cache: Path | None = None,
 ) -> MeshHierarchy:
     """A mesh and ``levels`` coarser ones, each with a ``factor``-th of the vertices (rounded up) of the one before.
 
-    Numbers of vertices depend on V, ``factor`` and ``levels`` alone. The result is cached in a file under the hash of
-    everything it depends on; a damaged file is written again, and without a writable folder nothing is cached.
+    Numbers of vertices depend on V, ``factor`` and ``levels`` alone.
 
     Args:
-        template: (V, 3) positions in any unit; used in float32, as the hash is.
+        template: (V, 3) positions in any unit; used in float32.
         faces: (F, 3) vertex indices.
         levels: down-samplings.
         factor: vertices of a level to one of the next.
         spiral_length: vertices of a spiral, its centre included.
         dilation: distance along the spiral between two of them.
         pooling: whether a coarse vertex is one vertex of its cluster or the cluster's mean.
-        vertices: the vertices to use (e.g. a face without its eyeballs), an index set; all if None. Faces with a
-            corner elsewhere are dropped.
-        cache: folder of the files; ``topology`` in facediff's cache if None.
     """
-    template = np.asarray(np.asarray(template, np.float32), np.float64)
-    faces = checked_faces(faces, len(template))
-    selection = None if vertices is None else np.unique(vertices)
-    key = _key(template, faces, selection, [levels, factor, spiral_length, dilation, pooling])
-    # Three levels of a dense mesh take some seconds, and every training on its corpus needs the same ones.
-    path = (cache or cache_dir() / "topology") / f"{key}.npz"
-    with suppress(ValueError, KeyError, FaceDiffError):  # there is no such file, or it is damaged
-        return MeshHierarchy.from_arrays(read_arrays(path))
-    points, inner = template, faces
-    if selection is not None:
-        row = np.full(len(template), -1)
-        row[selection] = np.arange(len(selection))
-        points, inner = template[selection], row[faces][(row[faces] >= 0).all(axis=1)]
+    points, inner = np.asarray(np.asarray(template, np.float32), np.float64), checked_faces(faces, len(template))
     mesh_levels = []
-    for _ in range(levels):
-        coarse = coarsen(points, inner, -(-len(points) // factor), pooling)
+    for level in range(levels + 1):
         table = spirals(inner, len(points), spiral_length, dilation, points)
-        mesh_levels.append(MeshLevel(len(points), inner, table, coarse.down, coarse.up))
+        if level == levels:
+            mesh_levels.append(MeshLevel(len(points), inner, table, None))
+            break
+        coarse = coarsen(points, inner, -(-len(points) // factor), pooling)
+        mesh_levels.append(MeshLevel(len(points), inner, table, coarse.down))
         points, inner = coarse.template, coarse.faces
-    table = spirals(inner, len(points), spiral_length, dilation, points)
-    mesh_levels.append(MeshLevel(len(points), inner, table, None, None))
-    hierarchy = MeshHierarchy(len(template), selection, tuple(mesh_levels))
-    with suppress(FaceDiffError), atomic(path) as temporary:  # a hierarchy that cannot be cached is computed again
-        np.savez(temporary, allow_pickle=False, **hierarchy.arrays())
-    return hierarchy
+    return MeshHierarchy(tuple(mesh_levels))
 
 
-def _key(template: Points, faces: Indices, vertices: Indices | None, options: list[int | str]) -> str:
-    """Hash of all that a hierarchy depends on."""
-    try:
-        library = version("fast-simplification")
-    except PackageNotFoundError:
-        library = "none"
-    shapes = [len(template), len(faces), -1 if vertices is None else len(vertices)]
-    digest = hashlib.sha256(json.dumps([VERSION, library, shapes, options]).encode())
-    # Little-endian on all machines: one cache may be shared by several.
-    digest.update(template.astype("<f4").tobytes())
-    digest.update(faces.astype("<i8").tobytes())
-    if vertices is not None:
-        digest.update(vertices.astype("<i8").tobytes())
-    return digest.hexdigest()
-
-
-# One step down: fewer vertices on the same surface by quadric edge collapse, and the sparse maps down and up again.
+# One step down: fewer vertices on the same surface by quadric edge collapse.
 
 EDGE = 25.0
 """Mean edge length that a mesh is scaled to before it is simplified.
@@ -215,7 +114,6 @@ class Coarse:
     faces: Indices  # (G, 3) vertex indices; no face names a vertex twice and no two faces have the same vertices
     clusters: Indices  # (V,) which coarse vertex each vertex became part of
     down: Operator  # from the V vertices to the M coarse ones
-    up: Operator  # from the M coarse vertices to the V ones
 
 
 def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, pooling: Pooling = "select") -> Coarse:
@@ -227,8 +125,6 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     into clusters, of which each gives one coarse vertex: the vertex nearest to the cluster's mean (``select``: a row
     of ``down`` has one entry, 1) or the mean (``mean``). A vertex without faces joins the vertex with faces nearest to
     it. Where the simplifier stops too early (it takes no edge that would fold the surface), the shortest edges follow.
-
-    ``up`` writes each vertex as a point of the coarse face nearest to it, among those around its cluster.
     """
     points = np.asarray(template, np.float64)
     faces = checked_faces(faces, len(points))
@@ -250,11 +146,7 @@ def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, p
     # Faces without those that lost a corner, and of those with the same corners the first.
     coarse_faces = checked_faces(clusters[faces], n_vertices)
     coarse_faces = coarse_faces[np.sort(np.unique(np.sort(coarse_faces, axis=1), axis=0, return_index=True)[1])]
-    corners, weights = project(points, coarse, coarse_faces, clusters)
-    # Weights of zero would make the operators larger for nothing: a point on an edge has two corners.
-    rows, slots = np.nonzero(weights > 0)
-    up = Operator(rows, corners[rows, slots], weights[rows, slots].astype(np.float32), (len(points), n_vertices))
-    return Coarse(coarse, coarse_faces, clusters, down, up)
+    return Coarse(coarse, coarse_faces, clusters, down)
 
 
 def _means(clusters: Indices, count: int) -> Operator:
@@ -334,33 +226,3 @@ def _merged(points: Array, faces: Indices, labels: Indices, n_vertices: int) -> 
             roots[second], left = first, left - 1
             merged[[first, second]] = True
     return np.unique(roots[labels], return_inverse=True)[1]
-
-
-def project(points: Array, coarse: Array, faces: Indices, clusters: Indices) -> tuple[Indices, Array]:
-    """The point on a coarse mesh (M, 3), (G, 3) nearest to each point (V, 3): corners of its face and their weights.
-
-    The search covers the faces at the coarse vertex (V,) of a point and at its neighbours. Where there are no such
-    faces, the coarse vertex itself is the result. Weights are at least 0 and sum to one; of equally near faces, the
-    first counts.
-    """
-    from scipy.sparse import csr_array
-
-    corners = np.repeat(clusters[:, None], 3, axis=1)
-    weights = np.tile([1.0, 0.0, 0.0], (len(points), 1))
-    if not len(faces):
-        return corners, weights
-    # Vertices and their faces as a sparse matrix: its product with its transpose has an entry for every pair of
-    # neighbours, and the product with the matrix again one for every face around a vertex or one of its neighbours.
-    index = np.arange(0, faces.size + 1, 3)
-    touching = csr_array((np.ones(faces.size), faces.ravel(), index), shape=(len(faces), len(coarse))).T
-    # A point's nearest face lies next to its cluster's vertex or one edge further; searching all faces could jump to
-    # the other lip, which touches this one at rest.
-    around = (touching @ touching.T @ touching).tocsr()
-    pairs = around[clusters].tocoo()
-    point, face = pairs.row, pairs.col
-    share, square = closest_on_triangles(points[point], coarse[faces[face]])
-    order = np.lexsort((face, square, point))
-    searched, best = np.unique(point[order], return_index=True)
-    best = order[best]
-    corners[searched], weights[searched] = faces[face[best]], share[best]
-    return corners, weights

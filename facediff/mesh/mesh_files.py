@@ -1,4 +1,4 @@
-"""Reader of mesh files: OBJ, PLY, STL, OFF and binary glTF.
+"""Reader of mesh files: OBJ, PLY and binary glTF.
 
 Every format has a parser here. Mesh libraries drop vertices, or replace them by zeros, in files that are cut short, mix
 polygons, or hold textures or sparse data, and several open other files that a file names. These parsers read a file
@@ -8,7 +8,6 @@ exactly or refuse it: the counts in its header must match its data, and no other
 from __future__ import annotations
 
 import re
-import struct
 from codecs import BOM_UTF8
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -34,7 +33,7 @@ def read_mesh(path: Path, *, points_allowed: bool = False) -> Mesh:
     r"""Read a mesh without merging, dropping or reordering a vertex.
 
     Args:
-        path: an ``.obj``, ``.ply``, ``.stl``, ``.off`` or ``.glb`` file.
+        path: an ``.obj``, ``.ply`` or ``.glb`` file.
         points_allowed: whether a file without faces is accepted; its mesh has faces of shape (0, 3).
 
     Example:
@@ -283,73 +282,9 @@ def _ply_text(elements: list[_Element], cells: list[bytes]) -> dict[str, Columns
     return columns
 
 
-# STL: triangles without shared vertices; they stay as the file has them.
-
-_STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-
-
-def _read_stl(data: bytes, path: Path) -> Mesh:
-    stated = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else -1
-    if len(data) == 84 + stated * _STL_ROW.itemsize:
-        points = np.frombuffer(data, _STL_ROW, stated, 84)["corners"].reshape(-1, 3).astype(np.float64)
-    elif data.lstrip()[:5].lower() == b"solid":
-        points = _stl_text(data, path)
-    else:
-        raise ValueError(f"its {len(data)} bytes are not those of the {max(0, stated)} triangles that it declares")
-    return Mesh(points, np.arange(len(points), dtype=np.int32).reshape(-1, 3))
-
-
-def _stl_text(data: bytes, path: Path) -> Array:
-    numbers: list[float] = []
-    facet, solid = 0, False
-    for line in data.lower().splitlines():
-        match line.split():
-            case [b"vertex", *coordinates] if len(coordinates) == 3:
-                numbers += [float(word) for word in coordinates]
-                facet += 1
-            case [b"endfacet", *_] if facet == 3:
-                facet = 0
-            case [b"solid", *_]:
-                solid = True
-            case [b"endsolid", *_] if solid and not facet:
-                solid = False
-            case [] | [b"facet" | b"outer" | b"endloop", *_]:
-                pass
-            case _:
-                raise ValueError(f"it has the line {line[:60]!r}")
-    if solid or facet:
-        raise ValueError("it is cut short: its last solid does not end")
-    return np.array(numbers).reshape(-1, 3)
-
-
-# OFF.
-
-
-def _read_off(data: bytes, path: Path) -> Mesh:
-    head = re.match(rb"\s*(?:#[^\n]*\n\s*)*(?:ST)?(C?)(N?)OFF\b", data)
-    if head is None:
-        raise ValueError("it does not begin with OFF")
-    lines = [cells for line in data[head.end() :].splitlines() if (cells := line.partition(b"#")[0].split())]
-    n_vertices, n_faces = int(lines[0][0]), int(lines[0][1])
-    if len(lines) < 1 + n_vertices + n_faces:
-        raise ValueError(f"it is cut short: its {n_vertices} vertices and {n_faces} faces are not all there")
-    rows = lines[1 : 1 + n_vertices]
-    points = np.array([[float(word) for word in row[:3]] for row in rows]).reshape(n_vertices, 3)
-    colours, first = None, 6 if head[2] else 3  # after the normal
-    if head[1] and all(len(row) >= first + 3 for row in rows):
-        table = [[float(word) for word in row[first : first + 3]] for row in rows]
-        colours = _colours(np.array(table).reshape(n_vertices, 3))
-    polygons = []
-    for line in lines[1 + n_vertices : 1 + n_vertices + n_faces]:
-        polygons.append([int(line[1 + corner]) for corner in range(int(line[0]))])
-    return Mesh(points, _cut(polygons, n_vertices), colours)
-
-
 READERS: dict[str, Callable[[bytes, Path], Mesh]] = {
     ".ply": _read_ply,
     ".obj": _read_obj,
-    ".stl": _read_stl,
-    ".off": _read_off,
     ".glb": read_glb,
 }
 SUFFIXES = tuple(READERS)

@@ -1,4 +1,4 @@
-"""Down- and up-sampling: what holds for any mesh, and a sphere's surface."""
+"""Down-sampling: what holds for any mesh, and a sphere's surface."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facediff.mesh.hierarchy import Coarse, Operator, Pooling, coarsen, project
+from facediff.mesh.hierarchy import Coarse, Operator, Pooling, coarsen
 from facediff.mesh.mesh import surface_area
 from tests.fakes.biwi import faces_of
 from tests.fakes.meshes import relief, sphere, together
@@ -61,13 +61,11 @@ def test_operators_of_any_mesh(name: str, pooling: Pooling, factor: float) -> No
     count = int(np.ceil(len(points) / factor))
     assert coarse.template.shape == (count, 3)
     assert coarse.down.shape == (count, len(points))
-    assert coarse.up.shape == (len(points), count)
-    for operator in (coarse.down, coarse.up):
-        assert (np.diff(operator.rows) >= 0).all()
-        assert operator.weights.min() >= 0
-        np.testing.assert_allclose(dense(operator).sum(1), 1, atol=1e-6)
-        values = np.random.default_rng(1).normal(size=(operator.shape[1], 2))
-        np.testing.assert_allclose(operator.apply(values), dense(operator) @ values, atol=1e-9)
+    assert (np.diff(coarse.down.rows) >= 0).all()
+    assert coarse.down.weights.min() >= 0
+    np.testing.assert_allclose(dense(coarse.down).sum(1), 1, atol=1e-6)
+    values = np.random.default_rng(1).normal(size=(len(points), 2))
+    np.testing.assert_allclose(coarse.down.apply(values), dense(coarse.down) @ values, atol=1e-9)
     assert sorted(set(coarse.clusters)) == list(range(count))  # every vertex is in one cluster, none is empty
     down = dense(coarse.down)
     members = coarse.clusters == np.arange(count)[:, None]
@@ -91,7 +89,6 @@ def test_the_chosen_vertex_is_the_one_nearest_to_the_mean() -> None:
         members = np.flatnonzero(coarse.clusters == row)
         away = np.linalg.norm(points[members] - points[members].mean(0), axis=1)
         assert np.linalg.norm(points[chosen] - points[members].mean(0)) == pytest.approx(away.min())
-    np.testing.assert_allclose(coarse.up.apply(coarse.template)[coarse.down.columns], coarse.template, atol=1e-6)
 
 
 def test_parts_stay_apart_and_loose_vertices_join_the_nearest() -> None:
@@ -117,19 +114,6 @@ def test_a_spheres_surface_survives(pooling: Pooling) -> None:
     assert np.mean(outwards > 0) > 0.99
     sizes = np.bincount(coarse.clusters)
     assert np.quantile(sizes, 0.95) <= 12
-    assert np.abs(coarse.up.apply(coarse.template) - points).max() < 0.06
-
-
-@pytest.mark.parametrize("pooling", ["select", "mean"])
-def test_up_after_down_keeps_a_smooth_function(pooling: Pooling) -> None:
-    points, faces = sphere(40, 50)
-    coarse = coarsen(points, faces, 501, pooling)
-    smooth = np.stack([np.sin(2 * points[:, 0]), points[:, 1] * points[:, 2]], -1)
-    again = coarse.up.apply(coarse.down.apply(smooth))
-    assert np.abs(again - smooth).max() < 0.12
-    assert np.sqrt(np.square(again - smooth).mean()) < 0.025
-    rough = np.random.default_rng(0).normal(size=(len(points), 1))
-    assert np.abs(coarse.up.apply(coarse.down.apply(rough)) - rough).max() > 1  # the measure can fail
 
 
 def test_the_unit_does_not_matter() -> None:
@@ -151,25 +135,9 @@ def test_equal_bytes_in_another_process(tmp_path: Path) -> None:
         "from tests.fakes.meshes import relief\n"
         "c = coarsen(*relief(30, 25), 190)\n"
         "sys.stdout.buffer.write(b''.join(np.ascontiguousarray(x).tobytes() for x in "
-        "(c.template, c.faces, c.clusters, c.up.columns, c.up.weights, c.down.columns)))"
+        "(c.template, c.faces, c.clusters, c.down.columns)))"
     )
     runs = [subprocess.run([sys.executable, "-c", program], capture_output=True, cwd=ROOT, timeout=100) for _ in "ab"]
     assert runs[0].returncode == 0, runs[0].stderr
     assert runs[0].stdout == runs[1].stdout
     assert len(runs[0].stdout) > 1000
-
-
-def test_projection_against_a_search_over_points_of_the_triangle() -> None:
-    rng = np.random.default_rng(0)
-    corners, points = rng.normal(size=(3, 3)), 2 * rng.normal(size=(50, 3))
-    grid = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60
-    index, weights = project(points, corners, np.array([[0, 1, 2]]), np.zeros(50, np.int64))
-    np.testing.assert_array_equal(index, np.tile([0, 1, 2], (50, 1)))
-    np.testing.assert_allclose(weights.sum(1), 1)
-    assert weights.min() >= 0
-    found = np.linalg.norm(weights @ corners - points, axis=1)
-    best = np.linalg.norm((grid @ corners)[None] - points[:, None], axis=-1).min(1)
-    assert (found <= best + 1e-9).all()  # no point of the grid is nearer
-    assert (found >= best - 0.06).all()
-    assert (weights.min(1) > 0).any()
-    assert (weights.min(1) == 0).any()

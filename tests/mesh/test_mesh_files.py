@@ -35,10 +35,6 @@ def binary_ply(faces: bytes, n_faces: int = 1) -> bytes:
     return ply("element vertex 4", *XYZ, f"element face {n_faces}", LIST, body=CORNERS.tobytes() + faces)
 
 
-def stl(triangles: int, body: bytes) -> bytes:
-    return bytes(80) + struct.pack("<I", triangles) + body
-
-
 GOOD: dict[str, Any] = {
     "asset": {"version": "2.0"},
     "scene": 0,
@@ -87,13 +83,6 @@ REFUSED: dict[str, tuple[str, bytes]] = {
     "ply with vertex 4": (".ply", binary_ply(b"\x03" + struct.pack("<3i", 0, 1, 4))),
     "ply cut in its faces": (".ply", ascii_ply(SQUARE + "3 0 1 2\n", faces=2)),
     "ply of nan": (".ply", ascii_ply(SQUARE.replace("1 1 0", "1 nan 0") + "3 0 1 2\n")),
-    # STL
-    "stl of one more triangle": (".stl", stl(2, bytes(50))),
-    "stl that is cut": (".stl", b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"),
-    # OFF
-    "off cut in its faces": (".off", b"OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
-    "off with vertex 3": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n"),
-    "off with a short face": (".off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n"),
     # Binary glTF
     "glb beyond its view": (".glb", changed("bufferViews.0.byteLength", 47)),
     "glb beyond its data": (".glb", changed("bufferViews.1.byteOffset", 1 << 40)),
@@ -126,14 +115,14 @@ def test_a_mesh_that_lies_is_refused_in_one_sentence(name: str, tmp_path: Path) 
 ICO = trimesh.creation.icosphere(subdivisions=1)
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".off", ".stl", ".glb"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
 def test_a_mesh_is_read_as_it_was_written(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"ball{suffix}"
     ICO.export(path)
     mesh = read_mesh(path)
     corners = ICO.vertices[ICO.faces]
     np.testing.assert_allclose(mesh.vertices[mesh.faces], corners, atol=1e-6)
-    assert len(mesh.vertices) == (3 * len(ICO.faces) if suffix == ".stl" else len(ICO.vertices))
+    assert len(mesh.vertices) == len(ICO.vertices)
 
 
 MIXED = [[0, 1, 2, 3], [0, 1, 4], [4, 3, 2, 1, 0]]
@@ -141,7 +130,7 @@ CUT = [[0, 1, 4], [0, 1, 2], [2, 3, 0], [4, 3, 2], [4, 2, 1], [4, 1, 0]]
 POINTS = np.vstack([CORNERS, [[0, 0, 1]]]).astype("<f4")
 
 
-def test_polygons_of_several_sizes_are_cut_alike_in_all_formats(tmp_path: Path) -> None:
+def test_polygons_of_several_sizes_are_cut_alike_in_all_forms(tmp_path: Path) -> None:
     rows = "".join(f"{len(face)} {' '.join(map(str, face))}\n" for face in MIXED)
     points = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in POINTS)
     head = ["element vertex 5", *XYZ, "element face 3", LIST]
@@ -152,7 +141,6 @@ def test_polygons_of_several_sizes_are_cut_alike_in_all_formats(tmp_path: Path) 
         "little.ply": ply(*head, body=POINTS.tobytes() + faces),
         "big.ply": ply(*head, body=POINTS.astype(">f4").tobytes() + swapped, form="binary_big_endian"),
         "windows.ply": ply(*head, body=(points + rows).encode(), form="ascii").replace(b"\n", b"\r\n"),
-        "text.off": f"OFF # five points\n5 3 0\n\n{points}{rows}".encode(),
     }
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
@@ -182,18 +170,6 @@ def test_colours_of_a_ply_are_those_of_a_screen_whatever_their_type(kind: str, c
     read = read_mesh(tmp_path / "a.ply").colours
     assert read is not None
     assert read.tolist() == [[255, 51, 0]] * 4
-
-
-@pytest.mark.parametrize(
-    ("head", "after"),
-    [("COFF", "255 51 0 255"), ("STCOFF", "1 0.2 0 1 0.5 0.5"), ("CNOFF", "0 0 1 255 51 0"), ("NOFF", "0 0 1")],
-)
-def test_colours_of_an_off_are_where_its_head_says(head: str, after: str, tmp_path: Path) -> None:
-    body = "".join(f"{row} {after}\n" for row in SQUARE.splitlines())
-    (tmp_path / "a.off").write_text(f"{head}\n4 1 0\n{body}3 0 1 2\n")
-    mesh = read_mesh(tmp_path / "a.off")
-    assert mesh.vertices.tolist() == CORNERS.tolist()
-    assert (None if mesh.colours is None else mesh.colours.tolist()) == ([[255, 51, 0]] * 4 if "C" in head else None)
 
 
 def test_sparse_changes_of_a_glb_are_made(tmp_path: Path) -> None:
@@ -263,7 +239,6 @@ SQUARE_PLY = (
     "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
     "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
 )
-SQUARE_OFF = "OFF\n# caf\u00e9\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
 WRITTEN = {
     "PLY in Latin-1": (".ply", SQUARE_PLY.encode("latin-1")),
     "PLY with a line end of Unicode in a comment": (".ply", SQUARE_PLY.replace("caf", "\x85 caf").encode("latin-1")),
@@ -273,8 +248,6 @@ WRITTEN = {
     "OBJ in Latin-1": (".obj", SQUARE_OBJ.encode("latin-1")),
     "OBJ, indented": (".obj", SQUARE_OBJ.replace("\nv", "\n  v").replace("\nf", "\n\tf").encode()),
     "OBJ with lines that go on": (".obj", SQUARE_OBJ.replace("f 1 2 3", "f 1 2 \\\n 3").encode()),
-    "OFF with a mark": (".off", SQUARE_OFF.encode("utf-8-sig")),
-    "OFF in Latin-1": (".off", SQUARE_OFF.encode("latin-1")),
 }
 
 

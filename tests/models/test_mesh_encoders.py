@@ -6,7 +6,6 @@ import copy
 import io
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -28,9 +27,8 @@ Hierarchy = Callable[..., MeshHierarchy]
 
 
 @pytest.fixture(scope="module")
-def hierarchy(tmp_path_factory: pytest.TempPathFactory) -> Hierarchy:
-    folder: Path = tmp_path_factory.mktemp("topology")
-    return cache(lambda **options: mesh_hierarchy(*relief(ROWS, COLUMNS), cache=folder, **options))
+def hierarchy() -> Hierarchy:
+    return cache(lambda **options: mesh_hierarchy(*relief(ROWS, COLUMNS), **options))
 
 
 @pytest.fixture
