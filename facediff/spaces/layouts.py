@@ -148,22 +148,6 @@ LAYOUTS: dict[str, Layout] = {
         identity_array="betas",
         source="BEAT2: SMPL-X, whose jaw is a joint of the body",
     ),
-    "flame_gaussian_avatars": _flame(
-        *("expression 100", HEAD, ("neck", "axis_angle"), JAW),
-        *(("left_eye", "axis_angle"), ("right_eye", "axis_angle"), "translation 3"),
-        shape=300,
-        frame_rate=None,
-        arrays={
-            "expr": slice(0, 100),
-            "rotation": slice(0, 3),
-            "neck_pose": slice(0, 3),
-            "jaw_pose": slice(0, 3),
-            "eyes_pose": slice(0, 6),
-            "translation": slice(0, 3),
-        },
-        identity_array="shape",
-        source="GaussianAvatars: the video's rate",
-    ),
 }
 """The layouts by name."""
 

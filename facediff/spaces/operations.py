@@ -1,11 +1,11 @@
-"""Operations on motion in parameters: order of channels, frame rate, form of rotations, and standardisation.
+"""Operations on motion in parameters: order of channels, frame rate and form of rotations.
 
 Values are (T, C), one column for each channel of a space.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -28,11 +28,6 @@ def permuted(values: Values, source: Space, target: Space) -> tuple[Values, Spac
 
     Channels that the source lacks are 0, and the returned space declares them as absent, which differs from a channel
     at rest. Channels that the target lacks are left out.
-
-    Args:
-        values: (T, C) in the source's order.
-        source: their space.
-        target: the space of the result.
 
     Example:
         >>> from facediff.spaces.layouts import layout
@@ -67,63 +62,29 @@ def permuted(values: Values, source: Space, target: Space) -> tuple[Values, Spac
     return result, replace(target, version=version, rig=source.rig, rig_hash=source.rig_hash, absent=tuple(lacking))
 
 
-def truncated(values: Values, space: Space, counts: dict[str, int]) -> tuple[Values, Space]:
-    """The leading coefficients of families of channels, such as 50 of FLAME's 100 expressions.
-
-    A basis is ordered by variance, so that this is the same face with less detail and no refit.
-
-    Args:
-        values: (T, C).
-        space: their space.
-        counts: coefficients that are kept, by the family's name: ``{"expression": 50}``.
-    """
-    dropped: set[str] = set()
-    for family, count in counts.items():
-        members = {
-            name for name in space.channels if name.rpartition("_")[0] == family and name.rpartition("_")[2].isdecimal()
-        }
-        if count > len(members) or count < 0:
-            raise FaceDiffError(f"space: has {len(members)} coefficients of {family}; expected at least {count}")
-        dropped |= {name for name in members if int(name.rpartition("_")[2]) >= count}
-    columns = [index for index, name in enumerate(space.channels) if name not in dropped]
-    turns = tuple(replace(turn, start=columns.index(turn.start)) for turn in space.rotations)
-    channels = tuple(space.channels[index] for index in columns)
-    return values[:, columns], replace(space, channels=channels, rotations=turns)
-
-
 def with_rotations(values: Values, space: Space, form: Form, joints: tuple[str, ...] = ()) -> tuple[Array, Space]:
     """Values with their rotations in another form.
 
     Args:
         values: (T, C).
         space: their space.
-        form: the form of the result.
-        joints: joints that are converted; all if empty.
+        form: of the result.
+        joints: that are converted; all if empty.
     """
     from facediff.spaces.layouts import AXES
 
-    columns: list[Array] = []
-    channels: list[str] = []
-    turns: list[Rotation] = []
-    starts = {turn.start: turn for turn in space.rotations}
-    index = 0
-    while index < len(space.channels):
-        turn = starts.get(index)
-        if turn is None:
-            columns.append(np.asarray(values[:, index : index + 1], np.float64))
-            channels.append(space.channels[index])
-            index += 1
+    columns, channels, turns = np.asarray(values, np.float64), list(space.channels), []
+    for turn in sorted(space.rotations, key=lambda turn: turn.start, reverse=True):  # later ones keep their places
+        if (joints and turn.joint not in joints) or turn.form == form:
+            turns.append((turn.joint, turn.form, channels[turn.start]))
             continue
-        old = np.asarray(values[:, list(turn.channels)], np.float64)
-        names = [space.channels[channel] for channel in turn.channels]
-        new_form = form if not joints or turn.joint in joints else turn.form
-        if new_form != turn.form:
-            old, names = convert(old, turn.form, new_form), [f"{turn.joint}_{axis}" for axis in AXES[new_form]]
-        turns.append(Rotation(turn.joint, len(channels), new_form))
-        columns.append(old)
-        channels += names
-        index += WIDTHS[turn.form]
-    return np.concatenate(columns, axis=1), replace(space, channels=tuple(channels), rotations=tuple(turns))
+        run = slice(turn.start, turn.start + WIDTHS[turn.form])
+        turned = convert(columns[:, run], turn.form, form)
+        columns = np.concatenate([columns[:, : run.start], turned, columns[:, run.stop :]], axis=1)
+        channels[run] = [f"{turn.joint}_{axis}" for axis in AXES[form]]
+        turns.append((turn.joint, form, channels[turn.start]))
+    rotations = tuple(Rotation(joint, channels.index(first), kind) for joint, kind, first in reversed(turns))
+    return columns, replace(space, channels=tuple(channels), rotations=rotations)
 
 
 @ranges.checked
@@ -135,7 +96,7 @@ def resampled(values: Values, space: Space, frame_rate: ranges.FrameRate, new_ra
     Args:
         values: (T, C).
         space: their space.
-        frame_rate: frames a second.
+        frame_rate: frames a second of these.
         new_rate: frames a second of the result.
     """
     old_times = np.arange(len(values)) / frame_rate
@@ -167,37 +128,3 @@ def at_times(values: Values, space: Space, times: Array, new_times: Array) -> Ar
         inside = (share > 0)[:, None]
         result[:, list(turn.channels)] = np.where(inside, turned, result[:, list(turn.channels)])
     return np.asarray(result)
-
-
-@dataclass(frozen=True, eq=False)
-class Standardisation:
-    """Mean and standard deviation of each channel.
-
-    Channels that hardly move (ARKit's tongueOut, cheekPuff) would be blown up by their own deviation: below the floor,
-    they are divided by 1 and stay near 0.
-
-    Attributes:
-        mean: (C,).
-        deviation: (C,) divisors.
-        dead: channels without motion.
-    """
-
-    mean: Array
-    deviation: Array
-    dead: tuple[int, ...] = ()
-
-    @classmethod
-    def measured(cls, values: Values) -> Standardisation:
-        """Of all frames (T, C)."""
-        numbers = np.asarray(values, np.float64)
-        deviation = numbers.std(axis=0)
-        still = deviation <= FLOOR * deviation.max(initial=0.0)
-        return cls(numbers.mean(axis=0), np.where(still, 1.0, deviation), tuple(map(int, np.flatnonzero(still))))
-
-    def apply(self, values: Values) -> Array:
-        """Standardised values (T, C)."""
-        return np.asarray((values - self.mean) / self.deviation, np.float64)
-
-    def undo(self, values: Values) -> Array:
-        """The inverse of :meth:`apply`."""
-        return np.asarray(values * self.deviation + self.mean, np.float64)

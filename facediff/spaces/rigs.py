@@ -15,8 +15,8 @@ from facediff.errors import FaceDiffError
 from facediff.mesh.flame import EXPRESSIONS, Flame
 from facediff.spaces.arkit import ARKIT, absent_from, plain
 from facediff.spaces.rotations import convert
-from facediff.spaces.shape_files import ICT_NEUTRAL, ShapeFiles, read_shape_files
-from facediff.spaces.space import Form, Space
+from facediff.spaces.shape_files import ICT_NEUTRAL, read_shape_files
+from facediff.spaces.space import Space
 
 Array = npt.NDArray[np.float64]
 Values = npt.NDArray[np.floating]
@@ -48,20 +48,15 @@ class LinearRig:
     title: str = ""
 
     @classmethod
-    def from_files(cls, files: ShapeFiles) -> LinearRig:
-        """The rig of a set of shapes."""
+    def read(cls, path: Path) -> LinearRig:
+        """Read the morph targets of a ``.glb``, or a folder of meshes such as ICT-FaceKit's ``FaceXModel``."""
+        files = read_shape_files(path)
         if files.neutral is None:
             raise FaceDiffError(f"{files.path}: has no face at rest; add it as neutral{files.first.suffix}")
         neutral = np.asarray(files.neutral, np.float64)
-        deltas = np.asarray(files.shapes, np.float64) - neutral
         centimetres = plain(Path(files.rest).stem) == ICT_NEUTRAL
         unit = "m" if files.metric else "cm" if centimetres else ""
-        return cls(files.arkit_names, neutral, deltas, files.faces, unit, files.path.name)
-
-    @classmethod
-    def read(cls, path: Path) -> LinearRig:
-        """Read the morph targets of a ``.glb``, or a folder of meshes such as ICT-FaceKit's ``FaceXModel``."""
-        return cls.from_files(read_shape_files(path))
+        return cls(files.arkit_names, neutral, files.shapes - neutral, files.faces, unit, files.path.name)
 
     @cached_property
     def hash(self) -> str:
@@ -101,8 +96,7 @@ class LinearRig:
             neutral: (V, 3) another face at rest; the rig's own if None.
         """
         moved = np.asarray(values, np.float64) @ self.deltas.reshape(len(self.names), -1)
-        rest = self.neutral if neutral is None else np.asarray(neutral, np.float64)
-        return moved.reshape(len(values), *self.neutral.shape) + rest
+        return moved.reshape(len(values), *self.neutral.shape) + (self.neutral if neutral is None else neutral)
 
     def gram(self, weights: Values | None = None) -> Array:
         """G = D Dᵀ (C, C): x G xᵀ is the sum of the squared displacements of all vertices that weights x make.
@@ -159,7 +153,5 @@ def decode_flame(flame: Flame, values: Values, space: Space, shape: Values | Non
     turns = {"jaw": np.zeros((len(values), 3)), "head": np.zeros((len(values), 3))}
     for turn in space.rotations:
         if turn.joint in turns:
-            form: Form = turn.form
-            turns[turn.joint] = convert(values[:, list(turn.channels)], form, "axis_angle")
-    person = np.zeros(0) if shape is None else shape
-    return flame.vertices(person, expression, turns["jaw"], head=turns["head"])
+            turns[turn.joint] = convert(values[:, list(turn.channels)], turn.form, "axis_angle")
+    return flame.vertices(np.zeros(0) if shape is None else shape, expression, turns["jaw"], head=turns["head"])

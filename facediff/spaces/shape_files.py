@@ -57,7 +57,10 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
         vertices: of the mesh that they are for, by which the parts of a .glb are chosen; None for all that have shapes.
     """
     if path.suffix.lower() == ".glb":
-        return _read_glb(path, vertices)
+        with damaged(path, "not a readable .glb with shapes, export it again"):
+            targets = read_targets(open_glb(path), vertices)
+        points = targets.neutral + targets.deltas
+        return ShapeFiles(path, path, targets.names, points, targets.neutral, targets.faces, True, path.name)
     files = path.iterdir() if path.is_dir() else []
     candidates = sorted(f for f in files if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
     if any(plain(file.stem) == ICT_NEUTRAL for file in candidates):
@@ -80,39 +83,24 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
                 f"{file}: has {len(mesh.vertices)} vertices, or other triangles, and {files[0].name} "
                 f"{len(first.vertices)}; expected shapes of one mesh with the order of its vertices kept"
             )
-    points, faces = np.stack([mesh.vertices for mesh in meshes]), meshes[0].faces
-    names = [file.stem for file in shapes]
-    targets: npt.NDArray[np.floating] = points[len(rest) :]
-    notes: tuple[str, ...] = ()
-    if rest and plain(rest[0].stem) == ICT_NEUTRAL:
-        names, targets, notes = _joined_halves(names, targets, points[0])
+    names, points, notes = [file.stem for file in shapes], [mesh.vertices for mesh in meshes[len(rest) :]], []
+    for name in HALVED if rest and plain(rest[0].stem) == ICT_NEUTRAL else ():
+        halves = [f"{name}_L", f"{name}_R"]
+        if all(half in names for half in halves):
+            left, right = (points[names.index(half)] for half in halves)
+            rows = [row for row, other in enumerate(names) if other not in halves]
+            names, points = (
+                [*(names[k] for k in rows), name],
+                [*(points[k] for k in rows), left + right - first.vertices],
+            )
+            notes.append(f"{name} is the sum of its halves {' and '.join(halves)}")
     return ShapeFiles(
         path,
         files[0],
         tuple(names),
-        targets,
-        points[0] if rest else None,
-        faces if len(faces) else None,
+        np.stack(points),
+        first.vertices if rest else None,
+        first.faces if len(first.faces) else None,
         rest=rest[0].name if rest else "",
-        notes=notes,
+        notes=tuple(notes),
     )
-
-
-def _joined_halves(
-    names: list[str], shapes: npt.NDArray[np.floating], neutral: npt.NDArray[np.floating]
-) -> tuple[list[str], npt.NDArray[np.floating], tuple[str, ...]]:
-    """ICT-FaceKit's shapes, with halves added up where ARKit has one shape for both."""
-    moves, notes = dict(zip(names, shapes, strict=True)), []
-    for name in HALVED:
-        halves = [f"{name}_L", f"{name}_R"]
-        if all(half in moves for half in halves):
-            moves[name] = moves.pop(halves[0]) + moves.pop(halves[1]) - neutral
-            notes.append(f"{name} is the sum of its halves {' and '.join(halves)}")
-    return list(moves), np.stack(list(moves.values())), tuple(notes)
-
-
-def _read_glb(path: Path, vertices: int | None) -> ShapeFiles:
-    with damaged(path, "not a readable .glb with shapes, export it again"):
-        targets = read_targets(open_glb(path), vertices)
-    points = targets.neutral + targets.deltas
-    return ShapeFiles(path, path, targets.names, points, targets.neutral, targets.faces, metric=True, rest=path.name)

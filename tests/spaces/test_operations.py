@@ -1,4 +1,4 @@
-"""Permutation by name, cuts, forms of rotation, resampling and standardisation."""
+"""Permutation by name, forms of rotation and resampling."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Slerp
 from facediff.errors import FaceDiffError
 from facediff.spaces import Space, layout
 from facediff.spaces.layouts import parametric
-from facediff.spaces.operations import Standardisation, permuted, resampled, truncated, with_rotations
+from facediff.spaces.operations import permuted, resampled, with_rotations
 
 ORDERS = ("arkit", "arkit_51", "live_link", "audio2face", "mediapipe")
 
@@ -56,16 +56,6 @@ def test_permuted_refuses_other_versions_and_forms() -> None:
         permuted(np.zeros((1, 106)), layout("flame_artalk"), layout("flame_diffposetalk_model"))
 
 
-def test_truncated_takes_leading_coefficients_and_moves_rotations() -> None:
-    values = np.arange(106.0)[None]
-    cut, space = truncated(values, layout("flame_artalk"), {"expression": 50})
-    assert cut[0].tolist() == [*range(50), *range(100, 106)]
-    assert space.channels == layout("flame_diffposetalk").channels
-    assert space.rotations == layout("flame_diffposetalk").rotations
-    with pytest.raises(FaceDiffError, match="expression"):
-        truncated(cut, space, {"expression": 100})
-
-
 def test_with_rotations_and_back_is_the_same_motion() -> None:
     space = layout("flame_artalk")
     values = np.random.default_rng(2).normal(0, 0.5, (20, 106))
@@ -87,15 +77,3 @@ def test_resampled_rotations_are_scipys_slerp_and_weights_linear() -> None:
     expected = Slerp(times, Reference.from_rotvec(values[:, 2:]))(new_times).as_matrix()
     assert np.abs(Reference.from_rotvec(new[:, 2:]).as_matrix() - expected).max() < 1e-9
     assert np.array_equal(resampled(values, space, 30.0, 30.0), values)
-
-
-def test_standardisation_leaves_dead_channels_small() -> None:
-    values = np.random.default_rng(4).normal(0.3, 0.2, (200, 3))
-    values[:, 1] = 0.1
-    values[:, 2] = 1e-7 * values[:, 0]
-    scale = Standardisation.measured(values)
-    scaled = scale.apply(values)
-    assert scale.dead == (1, 2)
-    assert abs(scaled[:, 0].std() - 1) < 1e-9
-    assert np.abs(scaled[:, 1:]).max() < 1e-6
-    assert np.abs(scale.undo(scaled) - values).max() < 1e-12

@@ -98,24 +98,23 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     parts = []
     for key, columns in (entry.arrays or {}).items():
         with damaged(f"{path}: {key}", "expected numbers (frames, channels)"):
-            array: npt.NDArray[np.float64] = np.asarray(content[key], np.float64)
-            array = array.reshape(array.shape[-2], array.shape[-1])
+            array = np.asarray(content[key], np.float64).reshape(content[key].shape[-2:])
         # Exact for arrays that belong to the layout alone; SMPL-X's poses have the body's joints around the jaw.
         if array.shape[1] < columns.stop or (columns.start == 0 and array.shape[1] != columns.stop):
             raise FaceDiffError(
-                f"{path}: {key} has {array.shape[1]} columns; expected {columns.stop} in {layout}; cut more of them to "
-                f"the leading ones with facediff.spaces.operations.truncated"
+                f"{path}: {key} has {array.shape[1]} columns; expected {columns.stop} in {layout}; of more, write the "
+                f"leading ones"
             )
         parts.append(array[:, columns])
     with damaged(path, "expected as many frames in each array"):
         values = np.concatenate(parts, axis=1)
     person = None
     if entry.identity_array in content:
-        shape = content[entry.identity_array]
-        shape = np.asarray(shape, np.float64)
+        shape = np.atleast_2d(np.asarray(content[entry.identity_array], np.float64))
         # A reconstruction has a shape for each frame, which is one person's all the same.
-        rows = shape.mean(0, keepdims=True) if path.suffix.lower() in HDF5_SUFFIXES else shape
-        person = checked(path, (rows if rows.ndim == 2 else rows.reshape(1, -1))[:1], rate)[0]
+        person = checked(
+            path, shape.mean(0, keepdims=True) if path.suffix.lower() in HDF5_SUFFIXES else shape[:1], rate
+        )[0]
     return _clip(path, checked(path, values, rate), entry, rate, layout, person)
 
 
@@ -123,7 +122,7 @@ def _rate(path: Path, given_rate: float | None, entry: Layout, stated: float | N
     rate = given_rate or stated or entry.frame_rate
     if rate is None:
         raise FaceDiffError(f"{path}: its layout has no rate of its own; give the frame rate of the video")
-    return check_number(path, "frame rate", rate, *FRAME_RATES)
+    return rate
 
 
 def _clip(
@@ -184,35 +183,27 @@ def write_array(path: Path, clip: ParameterClip, layout: str = "") -> None:
         clip: with the layout's channels in its order; the coefficients of a person it does not have are zero.
         layout: name of the layout; the clip's own if empty.
     """
-    name = layout or clip.layout
+    name, archive = layout or clip.layout, path.suffix.lower() == ".npz"
     entry = find_layout(name, str(path))
-    archive = path.suffix.lower() == ".npz"
     if clip.space.channels != entry.space.channels or not (entry.arrays if archive else entry.flat):
         raise FaceDiffError(
             f"{path}: {name} has other channels, or {'.npy' if archive else '.npz'} files only; change the clip's "
             f"order or rotations first, or the suffix"
         )
-    person = np.zeros(entry.identity, np.float32) if clip.identity is None else clip.identity
-    if archive:
-        content = dict(_archive(clip, entry))
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        if not archive:
+            person = np.zeros(entry.identity, np.float32) if clip.identity is None else clip.identity
+            leading = np.broadcast_to(person, (len(clip.values), entry.identity))
+            np.save(stream, np.concatenate([leading, clip.values], axis=1), allow_pickle=False)
+            return
+        content: dict[str, npt.NDArray[np.floating]] = {"fps": np.array(clip.frame_rate)}
         if entry.identity_array and clip.identity is not None:
             content[entry.identity_array] = clip.identity
-        with atomic(path) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **content)
-        return
-    leading = np.broadcast_to(person, (len(clip.values), entry.identity))
-    with atomic(path) as temporary, temporary.open("wb") as stream:
-        np.save(stream, np.concatenate([leading, clip.values], axis=1), allow_pickle=False)
-
-
-def _archive(clip: ParameterClip, entry: Layout) -> Mapping[str, npt.NDArray[np.floating]]:
-    content: dict[str, npt.NDArray[np.floating]] = {"fps": np.array(clip.frame_rate)}
-    first = 0
-    for key, columns in (entry.arrays or {}).items():
-        width = columns.stop - columns.start
-        # Of SMPL-X's 55 joints only the jaw is known; the body is at rest.
-        array = np.zeros((len(clip.values), 165 if columns.start else columns.stop), np.float32)
-        array[:, columns] = clip.values[:, first : first + width]
-        content[key] = array
-        first += width
-    return content
+        first = 0
+        for key, columns in (entry.arrays or {}).items():
+            # Of SMPL-X's 55 joints only the jaw is known; the body is at rest.
+            content[key] = np.zeros((len(clip.values), 165 if columns.start else columns.stop), np.float32)
+            width = columns.stop - columns.start
+            content[key][:, columns] = clip.values[:, first : first + width]
+            first += width
+        np.savez(stream, allow_pickle=False, **content)

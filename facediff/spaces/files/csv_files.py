@@ -120,18 +120,16 @@ def _rate(path: Path, times: Array, numbers: Sequence[int]) -> float:
 def gaze(names: Sequence[str], weights: Values) -> Array:
     """Rotations of the left and the right eye (T, 6) that weights of ``eyeLook`` shapes stand for.
 
+    Each has yaw to the face's left, pitch down and roll, in radians about the axes of a right-handed face. The roll is
+    the product of both, as in the app's recordings; without any of the shapes, an eye looks ahead.
+
     Args:
         names: K names of the weights.
         weights: (T, K).
-
-    Returns:
-        Yaw to the face's left, pitch down and roll of each eye, in radians about the axes of a right-handed face. The
-        roll is the product of both, as in the app's recordings; without any of the shapes, an eye looks ahead.
     """
-    none = np.zeros(len(weights))
 
     def weight(name: str) -> Array:
-        return np.asarray(weights[:, names.index(name)], np.float64) if name in names else none
+        return weights[:, names.index(name)].astype(np.float64) if name in names else np.zeros(len(weights))
 
     columns: list[Array] = []
     for side, outwards in (("Left", 1.0), ("Right", -1.0)):
@@ -172,9 +170,13 @@ def read_live_link(path: Path) -> ParameterClip:
         times.append(stamp)
         numbers.append(number)
         values.append(_numbers(path, number, [*row, *("0" for _ in lacking)], columns, len(header)))
-    return _timed(
-        path, _clock(path, np.array(times).reshape(-1, 2)), _with_mirrored(np.array(values)), lacking, numbers
-    )
+    clock = _clock(path, np.array(times).reshape(-1, 2))
+    rate = _rate(path, clock, numbers)
+    table = checked(path, np.array(values), rate)
+    table[:, len(ARKIT) :] = mirrored(table[:, len(ARKIT) :])
+    space = replace(space, absent=(*space.absent, *lacking))
+    clip = ParameterClip(path.stem, table, space, rate, clock - clock[0], float(clock[0]), layout="live_link")
+    return replace(clip, notes=(f"{clip.dropped} rows were dropped in the recording",)) if clip.dropped else clip
 
 
 def mirrored(rotations: Values) -> Values:
@@ -185,38 +187,16 @@ def mirrored(rotations: Values) -> Values:
     return np.where(_MIRRORED, 0.0 - rotations, rotations)  # and not −0
 
 
-def _with_mirrored(values: Values) -> Values:
-    """Values (T, 61) with rotations in the other frame."""
-    return (
-        np.concatenate([values[:, : len(ARKIT)], mirrored(values[:, len(ARKIT) :])], axis=1) if len(values) else values
-    )
-
-
-def _timed(path: Path, clock: Array, values: Values, lacking: list[str], numbers: list[int]) -> ParameterClip:
-    rate = _rate(path, clock, numbers)
-    space = layout("live_link")
-    space = replace(space, absent=(*space.absent, *lacking))
-    clip = ParameterClip(
-        path.stem, checked(path, values, rate), space, rate, clock - clock[0], float(clock[0]), layout="live_link"
-    )
-    notes = [f"{clip.dropped} rows were dropped in the recording"] if clip.dropped else []
-    return replace(clip, notes=tuple(notes))
-
-
 def write_live_link(path: Path, clip: ParameterClip) -> None:
-    """Write a recording as Live Link Face does; it appears whole or not at all.
-
-    Args:
-        path: the table.
-        clip: in a space of ARKit's; channels that it lacks or declares as absent are 0.
-    """
+    """Write a recording in a space of ARKit's as Live Link Face does; channels that it lacks are 0."""
     with atomic(path) as temporary:
         write_table(temporary, [live_link_header(), *live_link_rows(clip)])
 
 
 def live_link_rows(clip: ParameterClip) -> Iterator[list[str]]:
     """The rows of a recording's table, below :func:`live_link_header`; :func:`read_live_link` is the inverse."""
-    values = _with_mirrored(permuted(clip.values, clip.space, layout("live_link"))[0])
+    values = permuted(clip.values, clip.space, layout("live_link"))[0]
+    values[:, len(ARKIT) :] = mirrored(values[:, len(ARKIT) :])
     times = np.arange(len(values)) / clip.frame_rate if clip.times is None else clip.times
     count = str(len(ARKIT) + len(ROTATIONS))
     for seconds, row in zip(times, values, strict=True):
@@ -236,31 +216,15 @@ def read_audio2face(path: Path) -> ParameterClip:
     lacking = [name for name in space.channels if name not in shapes]
     columns = columns_of(path, [*(name.removeprefix(PREFIX) for name in header), *lacking], space)
     wide = len(header) + len(lacking)
-    at_time = header.index("timeCode")
-    values = []
-    times = []
-    for number, row in enumerate(rows, start=2):
-        full = [*row, *("0" for _ in lacking)]
-        times.append(_numbers(path, number, full, [at_time], wide)[0])
-        values.append(_numbers(path, number, full, columns, wide))
-    clock = np.array(times)
+    cells = [
+        _numbers(path, number, [*row, *("0" for _ in lacking)], [header.index("timeCode"), *columns], wide)
+        for number, row in enumerate(rows, start=2)
+    ]
+    table = np.array(cells).reshape(len(cells), -1)
+    clock = table[:, 0] if len(table) else np.zeros(0)
     rate = _rate(path, clock, range(2, len(clock) + 2))
-    numbers, space = checked(path, np.array(values), rate), replace(space, absent=tuple(lacking))
-    return ParameterClip(path.stem, numbers, space, rate, clock - clock[0], float(clock[0]), layout="audio2face")
-
-
-def write_audio2face(path: Path, clip: ParameterClip) -> None:
-    """Write weights as Audio2Face's service does; arguments as in :func:`write_live_link`."""
-    values, space = permuted(clip.values, clip.space, layout("audio2face"))
-    present = [index for index, name in enumerate(space.channels) if name not in space.absent]
-    times = np.arange(len(values)) / clip.frame_rate if clip.times is None else clip.times
-    header = ["timeCode", *(f"{PREFIX}{space.channels[index]}" for index in present)]
-    rows = (
-        [repr(round(clip.start + float(seconds), 9)), *map(shortest, row[present])]
-        for seconds, row in zip(times, values, strict=True)
-    )
-    with atomic(path) as temporary:
-        write_table(temporary, [header, *rows])
+    values, space = checked(path, table[:, 1:], rate), replace(space, absent=tuple(lacking))
+    return ParameterClip(path.stem, values, space, rate, clock - clock[0], float(clock[0]), layout="audio2face")
 
 
 def _numbers(path: Path, number: int, row: list[str], columns: list[int], width: int) -> list[float]:

@@ -8,14 +8,7 @@ from facediff.errors import check_known, refuse_idle
 from facediff.spaces.files.arrays import read_array, write_array
 from facediff.spaces.files.beat import read_beat, write_beat
 from facediff.spaces.files.clips import ParameterClip
-from facediff.spaces.files.csv_files import (
-    COUNT,
-    REMEDY,
-    read_audio2face,
-    read_live_link,
-    write_audio2face,
-    write_live_link,
-)
+from facediff.spaces.files.csv_files import COUNT, REMEDY, read_audio2face, read_live_link, write_live_link
 from facediff.utils.hdf5 import HDF5_SUFFIXES
 from facediff.utils.paths import from_home
 from facediff.utils.plain_files import read_columns
@@ -42,8 +35,7 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
     refuse_idle(f"{path} names its columns itself", layout=layout is not None)
     if suffix == ".json":
         return read_beat(path)
-    header, _ = read_columns(path, (COUNT,), remedy=REMEDY)
-    is_live_link = COUNT in header
+    is_live_link = COUNT in read_columns(path, (COUNT,), remedy=REMEDY)[0]
     return read_live_link(path) if is_live_link else read_audio2face(path)
 
 
@@ -53,12 +45,12 @@ def write_parameters(path: str | Path, clip: ParameterClip, *, layout: str = "")
     Args:
         path: the suffix chooses the format: ``.csv``, ``.json`` (BEAT's), ``.npy`` or ``.npz``.
         clip: the recording.
-        layout: of a ``.npy`` or ``.npz``, the clip's own if empty; ``audio2face`` for that table.
+        layout: of a ``.npy`` or ``.npz``; the clip's own if empty.
     """
     path = Path(path)
     suffix = _suffix(path, (".csv", ".json", ".npy", ".npz"))
     if suffix == ".csv":
-        (write_audio2face if layout == "audio2face" else write_live_link)(path, clip)
+        write_live_link(path, clip)
     elif suffix == ".json":
         write_beat(path, clip)
     else:

@@ -131,7 +131,7 @@ def test_read_live_link_counts_the_rows_without_a_face(tmp_path: Path) -> None:
         read_parameters(tmp_path / "take.csv")
 
 
-def test_audio2face_read_written_and_read_again(tmp_path: Path) -> None:
+def test_audio2face_is_read_by_its_names(tmp_path: Path) -> None:
     space = layout("audio2face")
     values = np.random.default_rng(2).random((4, 52)).astype(np.float32)
     header = "timeCode," + ",".join(f"blendShapes.{name[:1].upper()}{name[1:]}" for name in space.channels[:-1])
@@ -141,10 +141,6 @@ def test_audio2face_read_written_and_read_again(tmp_path: Path) -> None:
     assert clip.frame_rate == 30.0
     assert clip.space.absent == ("tongueOut",)
     assert np.array_equal(clip.values[:, :-1], values[:, :-1])
-    write_parameters(tmp_path / "b.csv", clip, layout="audio2face")
-    again = read_parameters(tmp_path / "b.csv")
-    assert np.array_equal(again.values, clip.values)
-    assert again.space == clip.space
 
 
 def test_every_arkit_order_reaches_a_live_link_table(tmp_path: Path) -> None:
