@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from facediff.cli.options import (
     File,
@@ -17,7 +17,7 @@ from facediff.cli.options import (
     named_folders,
 )
 from facediff.cli.process import confirm_cost, tell
-from facediff.errors import FaceDiffError, counted
+from facediff.errors import counted
 from facediff.study.options import StudyOptions
 from facediff.utils import ranges
 from facediff.utils.option import Option
@@ -122,53 +122,37 @@ def serve(
 
 
 def report(
-    studies: Annotated[list[str] | None, Option(metavar="STUDY", reads=True)] = None,
+    studies: Annotated[list[str], Option(metavar="STUDY", reads=True)],
     *,
     answers: Annotated[list[Path] | None, Option(metavar="FILE", many=True, reads=True)] = None,
     output: Annotated[Path | None, Option(also="-o", metavar="OUT", writes="folder")] = None,
-    interval: Literal["wilson", "binomial"] = "wilson",
     level: Annotated[ranges.Level, Option(metavar="P")] = 0.95,
     bootstrap: Annotated[ranges.Resamples, Option(metavar="N")] = 1000,
     seed: Seed = 0,
     json: Annotated[str | None, Option(metavar="FILE", writes="file", dash=True)] = None,
-    plan: Annotated[ranges.Preference | None, Option(metavar="D", without="answers output json interval")] = None,
-    power: Annotated[ranges.Power, Option(metavar="P", needs="plan")] = 0.8,
-    per_rater: Annotated[ranges.PerRater | None, Option(metavar="N", needs="plan")] = None,
-    correlation: Annotated[ranges.Correlation, Option(metavar="R", needs="plan")] = 0.1,
-    comparisons: Annotated[ranges.PerRater | None, Option(metavar="N", needs="plan")] = None,
 ) -> int:
-    """Analyse the answers to studies, or say how many raters one needs.
+    """Analyse the answers to studies.
 
-    It prints shares of preference with intervals, Bradley-Terry scores, agreement and excluded raters; with -o, it
-    writes the table for a paper (Markdown, LaTeX, CSV), a page, and every answer (CSV, JSON). Several studies, such as
-    biwi=FOLDER mead=FOLDER, become columns of one table. Exit status: 0 done, 1 answers had to be set aside.
+    It prints shares of preference with intervals, and excluded raters; with -o, it writes the table for a paper
+    (Markdown, LaTeX, CSV), a page, and every answer (CSV). Several studies, such as biwi=FOLDER mead=FOLDER, become
+    columns of one table. Exit status: 0 done, 1 answers had to be set aside.
 
     Args:
         studies: folders of `facediff study make`, each FOLDER or NAME=FOLDER
         answers: files that raters have downloaded, and folders of them; answers stored by `study serve` are always used
         output: folder for all tables
-        interval: of shares: Wilson's, or the exact binomial one
         level: of intervals
-        bootstrap: resamples for intervals between raters and of agreement; 0: none
+        bootstrap: resamples for intervals between raters; 0: none
         seed: of the resamples
         json: write everything as JSON; - prints it instead of the tables
-        plan: how many raters notice a share that lies by D above one half: 0.1 for 60 to 40
-        power: for --plan: the chance to notice it
-        per_rater: for --plan: answers of one rater to one comparison (default: as in the study, else 1)
-        correlation: for --plan: of two answers of one rater to one comparison
-        comparisons: for --plan: comparisons that are made (default: as in the study, else 1)
     """
-    folders = named_folders(studies or [])
-    if plan is not None:
-        return print_plan(folders, plan, power, level, per_rater, correlation, comparisons)
-    if not folders:
-        raise FaceDiffError("studies: missing; give the folder of a study, or --plan D")
+    folders = named_folders(studies)
     from facediff.study.analysis import analyse_folder
     from facediff.study.definition import read_study
     from facediff.study.report_files import text, write_report
     from facediff.utils.plain_files import json_text, write_json
 
-    options = {"interval": interval, "level": level, "resamples": bootstrap, "seed": seed}
+    options = {"level": level, "resamples": bootstrap, "seed": seed}
     ids = [read_study(folder).id for folder in folders.values()]
     reports = [
         analyse_folder(folder, answers or (), name=name, ignored=ids[:i] + ids[i + 1 :], **options)
@@ -187,33 +171,3 @@ def report(
         if json != "-":
             tell(f"written: {', '.join(str(path) for path in written)}")
     return int(any(note.startswith("set aside") for analysis in reports for note in analysis.notes))
-
-
-def print_plan(
-    folders: dict[str, Path],
-    difference: float,
-    power: float,
-    level: float,
-    per_rater: int | None,
-    correlation: float,
-    comparisons: int | None,
-) -> int:
-    """Print how many raters are needed."""
-    from facediff.study import raters_needed, read_study
-    from facediff.study.analysis import design_of
-
-    for name, folder in folders.items() or {"": None}.items():
-        defaults = (1, 1) if folder is None else design_of(read_study(folder))
-        answers, pairs = per_rater or defaults[0], comparisons or defaults[1]
-        needed = raters_needed(
-            difference, power=power, level=level, per_rater=answers, correlation=correlation, comparisons=pairs
-        )
-        worth = f"correlated by {correlation:g}, count as {answers / needed.design_effect:.2f}"
-        repeated = f"{answers} of a rater, {worth}; " if answers > 1 else ""
-        tell(
-            f"{name}{': ' if name else ''}{needed.raters} raters notice a preference of {50 + 100 * difference:g} to "
-            f"{50 - 100 * difference:g} with a chance of {power:.0%} at the level {level:g}",
-            f"({needed.answers} independent answers to each of {counted(pairs, 'comparison')}; {repeated}excluded "
-            f"raters come on top)",
-        )
-    return 0

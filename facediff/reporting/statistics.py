@@ -153,25 +153,6 @@ def wilson_interval(wins: float, count: float, level: float = 0.95) -> tuple[flo
     return (0.0 if wins <= 0 else middle - half), (1.0 if wins >= count else middle + half)
 
 
-def binomial_interval(wins: float, count: float, level: float = 0.95) -> tuple[float, float]:
-    """The exact binomial interval of Clopper and Pearson (1934), which never covers less than its level.
-
-    The arguments are as for :func:`wilson_interval`; half wins, of no difference, are taken as they are.
-
-    Example:
-        >>> [round(end, 4) for end in binomial_interval(89, 120)]
-        [0.6538, 0.8172]
-    """
-    if not count:
-        return 0.0, 1.0
-    from scipy.stats import beta
-
-    tail = (1 - level) / 2
-    lower = 0.0 if wins <= 0 else float(beta.ppf(tail, wins, count - wins + 1))
-    upper = 1.0 if wins >= count else float(beta.ppf(1 - tail, wins + 1, count - wins))
-    return lower, upper
-
-
 def binomial_p(wins: int, count: int) -> float:
     """Two-sided p value of the exact binomial test of a share against one half; 1 if nothing was counted.
 

@@ -2,8 +2,7 @@
 
 From top to bottom: :func:`plan_study` reads and checks animations and makes a :class:`StudyPlan`, whose ``make`` writes
 the study's folder; :func:`serve` hands the page out and stores answers; :func:`analyse_folder` makes a
-:class:`StudyReport` of them. :func:`simulate` gives answers of raters whose preference is known. Names are loaded on
-first use.
+:class:`StudyReport` of them. Names are loaded on first use.
 """
 
 from typing import TYPE_CHECKING
@@ -19,9 +18,7 @@ if TYPE_CHECKING:
     from facediff.study.making import StudyPlan as StudyPlan
     from facediff.study.making import plan_study as plan_study
     from facediff.study.options import StudyOptions as StudyOptions
-    from facediff.study.rating_statistics import raters_needed as raters_needed
     from facediff.study.server import serve as serve
-    from facediff.study.simulation import simulate as simulate
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
@@ -31,7 +28,5 @@ __getattr__, __dir__, __all__ = lazy_names(
         "making": "StudyPlan plan_study",
         "options": "StudyOptions",
         "server": "serve",
-        "simulation": "simulate",
-        "rating_statistics": "raters_needed",
     },
 )

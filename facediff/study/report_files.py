@@ -52,7 +52,6 @@ def write_report(reports: Sequence[StudyReport], folder: Path) -> list[Path]:
             "report.html": html_page("User study", blocks(reports, with_plots=True)),
             "table.tex": latex(main_table(reports, question) for question in questions(reports)),
             "report.json": json_text("report.json", {"studies": [report.as_dict() for report in reports]}) + "\n",
-            "answers.json": json_text("answers.json", {"answers": answers, "comments": texts}) + "\n",
         },
     )
     for name, rows in (
@@ -92,11 +91,10 @@ def main_table(reports: Sequence[StudyReport], question: str) -> ReportTable:
         shares = (report.preference(question, first, second) for report in reports)
         rows.append([f"{first} and {second}", *(None if share is None else share_of(share) for share in shares)])
     counts = "; ".join(f"{report.name}: {len(report.counted)} raters" for report in reports)
-    kind = {"wilson": "Wilson", "binomial": "exact binomial"}[reports[0].interval]
     return ReportTable(
         ["preferred, %", *(report.name for report in reports)],
         rows,
-        caption=f"User study, {question}: how often the first method of each pair was preferred, in %, with {kind} "
+        caption=f"User study, {question}: how often the first method of each pair was preferred, in %, with Wilson "
         f"intervals of {100 * reports[0].level:g} %. {counts}.",
     )
 
@@ -108,7 +106,7 @@ def share_of(preference: Preference) -> str:
 
 def pair_table(report: StudyReport, question: str) -> ReportTable:
     """Every pair of a study with all its numbers."""
-    head = ["pair", "answers", "first %", report.interval, "between raters", "p", "p corrected"]
+    head = ["pair", "answers", "first %", "wilson", "between raters", "p", "p corrected"]
     ties = any(preference.same for preference in report.preferences)
     rows: Cells = []
     for pair in report.preferences:
@@ -117,19 +115,6 @@ def pair_table(report: StudyReport, question: str) -> ReportTable:
             row += [between(*pair.interval, percent), between(*pair.between_raters, percent)]
             rows.append([*row, p_value(pair.p), p_value(pair.p_corrected), *([str(pair.same)] if ties else [])])
     return ReportTable([*head, "no difference"] if ties else head, rows)
-
-
-def score_tables(report: StudyReport, question: str) -> list[ReportTable]:
-    """Bradley-Terry scores, the highest first; no table where there are none."""
-    tables = []
-    for scores in report.scores:
-        if scores.question == question:
-            ordered = sorted(scores.scores.items(), key=lambda item: -item[1])
-            rows = [
-                [name, f"{score:+.3f}", between(*scores.intervals[name], "{:+.3f}".format)] for name, score in ordered
-            ]
-            tables.append(ReportTable(["Bradley-Terry", "score", "interval"], rows))
-    return tables
 
 
 def rater_table(report: StudyReport) -> ReportTable:
@@ -142,29 +127,16 @@ def rater_table(report: StudyReport) -> ReportTable:
 def facts(report: StudyReport) -> list[str]:
     """Definitions of the numbers, in sentences."""
     rule, level = report.study.rule, f"{100 * report.level:g} %"
-    kind = "Wilson's score" if report.interval == "wilson" else "the exact binomial (Clopper-Pearson)"
     lines = [
         f"Study {report.study.id}: {len(report.counted)} of {len(report.raters)} raters are counted. The rule was "
         f"fixed when the study was made: at least {rule.least_right:.0%} of the answers to controls name the truth and "
         f"not the still face, at least {rule.least_consistent:.0%} of repeated pairs are answered alike, at most "
         f"{rule.most_on_one_side:.0%} of all answers name one side"
         + (", and everything is answered." if rule.finished else "."),
-        f"Intervals are {level} ones: of shares, {kind} intervals of single answers; between raters, from drawing "
-        "raters again. Quote the latter where raters answer to a comparison more than once.",
+        f"Intervals are {level} ones: of shares, Wilson's score intervals of single answers; between raters, from "
+        "drawing raters again. Quote the latter where raters answer to a comparison more than once.",
         "p is of the exact binomial test against one half, corrected by Holm for the comparisons of a question.",
     ]
-    for scores in report.scores:
-        source = "the variance between raters" if scores.robust else "the likelihood of single answers"
-        lines.append(f"{scores.question}: intervals of Bradley-Terry scores come from {source}.")
-        if not scores.bounded:
-            lines.append(
-                f"{scores.question}: a condition always won or always lost, so that half a win was added to each side "
-                f"of every pair."
-            )
-    for agreement in report.agreement:
-        alpha = "is not known" if not math.isfinite(agreement.alpha) else f"is {agreement.alpha:.3f}"
-        ends = between(*agreement.interval, "{:.3f}".format)
-        lines.append(f"{agreement.question}: Krippendorff's alpha {alpha} {ends}, over {agreement.units} videos.")
     for question, (share, limits, count) in report.sides.items():
         lines.append(
             f"{question}: of {count} answers to the same animation on both sides, {percent(share, 1)} % name the left "
@@ -183,7 +155,6 @@ def blocks(reports: Sequence[StudyReport], *, with_plots: bool = False) -> list[
         for report in reports:
             document += [Title(f"{question}: {report.name}", 3), *(plots(report, question) if with_plots else [])]
             document += [pair_table(report, question)]
-            document += score_tables(report, question)
     for report in reports:
         document += [Title(f"Raters: {report.name}", 2), rater_table(report), Bullets(facts(report))]
     return document
@@ -194,7 +165,7 @@ def text(report: StudyReport) -> str:
     title = f"{report.name}: {len(report.counted)} of {len(report.raters)} raters are counted"
     document: list[Block] = [Paragraph(title)]
     for question in questions([report]):
-        document += [Title(question, 2), pair_table(report, question), *score_tables(report, question)]
+        document += [Title(question, 2), pair_table(report, question)]
     return terminal_text([*document, rater_table(report), Bullets(facts(report))])
 
 
@@ -239,7 +210,6 @@ def _preference_row(report: StudyReport, preference: Preference) -> dict[str, An
         SAME: preference.same,
         "share": preference.share,
         "level": report.level,
-        "interval": report.interval,
         "low": preference.interval[0],
         "high": preference.interval[1],
         "raters_low": low,

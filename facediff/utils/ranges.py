@@ -19,7 +19,6 @@ USUAL_BLINKS = 17.0
 Bound = Annotated[float, Range(-1000, 1000)]
 ChunkLength = Annotated[float, Range(0.01, 60)]
 ClipLength = Annotated[float, Range(1, 600)]
-Correlation = Annotated[float, Range(0, 1)]
 Duration = Annotated[float, Range(0.001, 604_800)]
 """Seconds that something lasts; a week at most."""
 Epochs = Annotated[int, Range(1, 100_000)]
@@ -44,11 +43,8 @@ Semitones = Annotated[float, Range(-12, 12)]
 TakeOffset = Annotated[float, Range(-3600, 3600)]
 PageWidth = Annotated[float, Range(30, 1000)]
 Pixels = Annotated[int, Range(16, 4096)]
-PerRater = Annotated[int, Range(1, 1000)]
 """Answers of one rater to one comparison of a user study, or comparisons in it."""
 Port = Annotated[int, Range(0, 65_535)]
-Power = Annotated[float, Range(0.5, 0.999)]
-Preference = Annotated[float, Range(0.005, 0.5)]
 """How far the share of answers that prefer something lies above one half."""
 Raters = Annotated[int, Range(1, 1_000_000)]
 Resamples = Annotated[int, Range(0, 1_000_000)]

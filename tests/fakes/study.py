@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from facediff.animation import write_archive
-from facediff.study.answers import FORMAT, Rater
+from facediff.study.answers import FORMAT, Answer, Rater, questions_of
 from facediff.study.definition import DATABASE, PAGE_FOLDER, VIDEO_FOLDER, Rule, Study, Trial
 from facediff.study.design import Design, Pairs, make_forms, make_pairs, make_schedules
 from facediff.study.page import write_page
-from facediff.study.simulation import simulate
 from facediff.study.store import AnswerStore
 from facediff.study.texts import bundled_question, standard
 from tests.fakes.clicks import RATE, SAMPLE_RATE, clicks
 
+DAY = "2026-01-01"
 METHODS = ("ours", "theirs")
 SCORES = {"ours": 0.4, "theirs": -0.5, "third": -0.1, "truth": 0.6}
 
@@ -72,6 +72,30 @@ def write_study(folder: Path, study: Study) -> Path:
     write_page(folder / PAGE_FOLDER, study)
     study.write(folder)
     return folder
+
+
+def simulate(
+    study: Study, scores: Mapping[str, float], raters: int, *, no_difference: float = 0.0, seed: int = 0
+) -> list[Rater]:
+    """Raters who prefer i to j with the chance 1 / (1 + exp(s_j - s_i)), and hardly ever a still face.
+
+    ``no_difference`` is the share of answers that see none, where a question allows it.
+    """
+    rng, scores = np.random.default_rng(seed), {"still": -6.0, **scores}
+
+    def rater(number: int) -> Rater:
+        answers = {}
+        for trial in study.trials_of(number):
+            replies = {}
+            for question, allowed in questions_of(study, trial).items():
+                left = rng.random() < 1 / (1 + np.exp(scores[trial.right] - scores[trial.left]))
+                same = "same" in allowed and rng.random() < no_difference
+                replies[question] = "same" if same else "left" if left else "right"
+            answers[trial.id] = Answer(trial.id, replies, 10.0, 1, f"{DAY}T00:{len(answers):02d}:00Z")
+        token = hashlib.sha256(f"{seed}/{number}".encode()).hexdigest()[:32]
+        return Rater(token, number, study.languages[0], "", f"{DAY}T00:00:00Z", f"{DAY}T23:59:59Z", answers)
+
+    return [rater(number) for number in range(raters)]
 
 
 def write_answers(folder: Path, study: Study, raters: int, seed: int = 0) -> AnswerStore:

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from facediff.cli.app import main
-from facediff.study import analyse_folder, simulate
+from facediff.study import analyse_folder
 from facediff.study.answers import merge
-from tests.fakes.study import SCORES, as_file, small_study, write_answers, write_study
+from tests.fakes.study import SCORES, as_file, simulate, small_study, write_answers, write_study
 
 
 def test_files_and_database_of_one_rater_are_one_rater(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

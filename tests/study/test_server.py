@@ -15,13 +15,12 @@ from typing import Any
 
 import pytest
 
-from facediff.study import simulate
 from facediff.study.definition import DATABASE, Study
 from facediff.study.server import MOST_BYTES, make_app
 from facediff.study.store import AnswerStore
 from facediff.utils.server import LOOPBACK
 from tests.fakes.serving import servers
-from tests.fakes.study import SCORES, small_study, write_study
+from tests.fakes.study import SCORES, simulate, small_study, write_study
 from tests.study.conftest import Serve
 
 TOKEN = "00112233445566778899aabbccddeeff"  # noqa: S105 - of a rater

@@ -14,10 +14,9 @@ from pathlib import Path
 import pytest
 
 from facediff.errors import FaceDiffError
-from facediff.study import simulate
 from facediff.study.answers import Answer
 from facediff.study.store import AnswerStore, FullError
-from tests.fakes.study import SCORES, small_study, write_answers
+from tests.fakes.study import SCORES, simulate, small_study, write_answers
 
 TOKEN = "0123456789abcdef" * 2
 
