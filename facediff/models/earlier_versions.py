@@ -47,8 +47,12 @@ REMOVED: dict[str, dict[str, Any]] = {
         "rows_per_frame": lambda options: (None, max(1, round(60.0 / options["frame_rate"]))),
         "alignment": "auto",
     },
-    "facediff.models.published.emotalk.EmoTalk": {"content_dim": ANY, "period": None, "alignment": "auto"},
-    "facediff.models.published.lam.LamAudio2Expression": {"chunk_seconds": 1.0, "alignment": "auto"},
+    "facediff.models.published.emotalk.EmoTalk": {
+        **{"content_dim": ANY, "period": None, "alignment": "auto", "finish": ""},
+    },
+    "facediff.models.published.lam.LamAudio2Expression": {
+        **{"chunk_seconds": 1.0, "alignment": "auto", "chunks": "none", "finish": ""},
+    },
     "facediff.models.published.unitalker.UniTalker": {
         **{"period": 30, "component_weight": 0.01, "value_weight": 1e-4, "common_share": 0.1, "alignment": "auto"},
         **{"long_windows": "published", "normalize_windows": True},

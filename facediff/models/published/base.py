@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch, Reference
-from facediff.errors import ArgumentError, FaceDiffError, OptionError
+from facediff.errors import ArgumentError, OptionError
 from facediff.hyperparameters import component_class
 from facediff.models.audio_encoders import AudioEncoder, AudioEncoderFactory, StepRule
 from facediff.models.base import AnimationModel, Decay
@@ -315,18 +315,8 @@ class DirectModel(PublishedModel):
         """Steps that the audio encoder is asked for, for each frame."""
         return 1
 
-    @property
-    def unexported(self) -> str:
-        """Options that were chosen and change the network's output, which no graph does; none by default."""
-        return ""
-
     def graphs(self) -> Graphs:
-        """Speech to features, features to motion; a model that goes on after its network is refused."""
-        if self.unexported:
-            raise FaceDiffError(
-                f"{type(self).__name__}: {self.unexported} cannot be exported, since graphs end with the network; "
-                f"import or train the model without it, and export that"
-            )
+        """Speech to features, features to motion."""
         return direct_graphs(self)
 
 

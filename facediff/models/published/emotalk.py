@@ -9,30 +9,23 @@ choices of the published code.
 
 from __future__ import annotations
 
-import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.data import Batch
 from facediff.errors import ArgumentError
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.graphs import SpeechInput
-from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, exporting, interpolate_ends
 from facediff.models.published.autoregressive import DecoderLayer
 from facediff.models.published.base import DirectModel, SpeakerTable, still_map
-from facediff.models.published.lam_postprocessing import read_steps
 from facediff.models.published.positions import periodic_bias
 from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
-from facediff.spaces import Space
 from facediff.speech.windows import STEP_RATE
 from facediff.utils.ranges import Range
 
@@ -41,19 +34,6 @@ if TYPE_CHECKING:
 
 EMOTION_RATE = 30
 """Steps a second of the emotion network's Transformer, at any frame rate of the motion."""
-
-FINISHING = ("smooth", "blinks")
-"""Steps of the authors' demonstration on the weights, in its order."""
-
-BLINKS = np.array(
-    [
-        [0.36537236, 0.950235724, 0.95593375, 0.916715622, 0.367256105, 0.119113259, 0.025357503],
-        [0.234776169, 0.909951985, 0.944758058, 0.777862132, 0.191071674, 0.235437036, 0.089163929],
-        [0.870040774, 0.949833691, 0.949418545, 0.695911646, 0.191071674, 0.072576277, 0.007108896],
-        [0.000307991, 0.556701422, 0.952656746, 0.942345619, 0.425857186, 0.148335218, 0.017659493],
-    ]
-)
-"""The demonstration's courses of a lid over seven frames."""
 
 
 @registry.model.register("EmoTalk")
@@ -75,8 +55,6 @@ class EmoTalk(DirectModel):
             directory.
         emotion_config: its configuration as plain data; if given, its weights are not read from ``emotion_source`` but
             left for a checkpoint to fill in. Checkpoints use it.
-        finish: postprocessing of the weights as in the demonstration: ``smooth`` (Savitzky-Golay, a parabola
-            through five frames) and ``blinks`` (stored blinks at random in place of the lids' motion); joined by ``+``.
         options: see :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
@@ -101,7 +79,6 @@ class EmoTalk(DirectModel):
         level: Annotated[int, Range(0, 999)] = 1,
         emotion_source: str = "r-f/wav2vec-english-speech-emotion-recognition",
         emotion_config: dict[str, Any] | None = None,
-        finish: str = "",
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
@@ -113,7 +90,6 @@ class EmoTalk(DirectModel):
         if not level < levels:
             raise ArgumentError({"level": level}, f"there are {levels} levels, counted from 0")
         self.level = level
-        self.finish = read_steps(finish, FINISHING, self.space)
         self.emotion_encoder = Wav2Vec2Encoder(dim=None, source=emotion_source, config=emotion_config, edges=False)
         self.network = EmoTalkNetwork(
             widths=(self.audio_width, self.emotion_encoder.width),
@@ -166,21 +142,6 @@ class EmoTalk(DirectModel):
         """Every frame sees those before it, and its own moment of the emotion; later frames and padding change none."""
         motion: Tensor = self.network(features, weights, self.level)
         return motion
-
-    def generate_frames(
-        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
-    ) -> BatchMotion:
-        """All frames in one pass, then the chosen postprocessing."""
-        motion = super().generate_frames(batch, frames, seeds=seeds, progress=progress)
-        for row, (count, seed) in enumerate(zip(frames.tolist(), seeds, strict=True) if self.finish else ()):
-            values = finished(motion[row, :count, :, 0].float().cpu().numpy(), self.finish, self.space, seed)
-            motion[row, :count, :, 0] = torch.from_numpy(values).to(motion)
-        return motion
-
-    @property
-    def unexported(self) -> str:
-        """What finishes the weights, if anything."""
-        return f"finish={'+'.join(sorted(self.finish))}" if self.finish else ""
 
 
 class EmoTalkNetwork(nn.Module):
@@ -236,29 +197,3 @@ class EmoTalkNetwork(nn.Module):
             x = layer(x, moments, layer.self_attention.keys_values(x), bias)  # type: ignore[union-attr, operator]
         motion: Tensor = self.motion_out(x)
         return motion
-
-
-# Postprocessing of the weights, as in the demonstration.
-
-
-def finished(
-    values: npt.NDArray[np.float32], steps: frozenset[str], space: Space, seed: int
-) -> npt.NDArray[np.float32]:
-    """Weights (T, C) after the steps that are chosen.
-
-    Random numbers come from Python's generator, so that ``random.seed`` gives the demonstration the same blinks.
-    """
-    result = values.astype(np.float64)
-    if "smooth" in steps and len(result) >= 5:  # fewer frames are fewer than the filter has
-        from scipy.signal import savgol_filter
-
-        result = savgol_filter(result, 5, 2, axis=0)
-    if "blinks" in steps:
-        generator, length = random.Random(seed), BLINKS.shape[1]  # noqa: S311 - no secret
-        lids = [space.index("eyeBlinkLeft"), space.index("eyeBlinkRight")]
-        result[:, lids] = 0
-        start = generator.randint(0, 60)
-        while start < len(result) - length:
-            result[start : start + length, lids] = BLINKS[generator.randint(1, 4) - 1][:, None]
-            start += generator.randint(60, 180)
-    return result.astype(np.float32)

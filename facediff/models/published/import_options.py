@@ -24,7 +24,7 @@ HPARAMS: dict[str, type] = {
 }
 """Options that such a file may hold, and their types; others are left to the checkpoint."""
 
-MODEL_HPARAMS = ("do_normalize", "epsilon", "num_heads", "codec_heads", "style_heads", "chunks", "finish")
+MODEL_HPARAMS = ("do_normalize", "epsilon", "num_heads", "codec_heads", "style_heads")
 """Options of models and audio encoders that such a file may hold."""
 
 

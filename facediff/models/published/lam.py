@@ -8,11 +8,10 @@ authors' checkpoint. docs/methods.md lists the options for choices of the publis
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -20,11 +19,10 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import BatchMotion, Progress, with_speech
+from facediff.models.inference import with_speech
 from facediff.models.layers import Heads, Share, Width, check_heads, exporting, frame_mask
 from facediff.models.published.base import DirectModel, SpeakerTable
 from facediff.models.published.convolutions import ConvolutionStack
-from facediff.models.published.lam_postprocessing import CONTEXT_FRAMES, PostprocessedRecording, Postprocessing
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import Space
 from facediff.utils import SAMPLE_RATE
@@ -33,9 +31,8 @@ from facediff.utils.ranges import Range
 if TYPE_CHECKING:
     from facediff.models.published.cards import AuthorFiles, Facts
 
-Chunks = Literal["none", "context", "silence"]
-"""How speech is cut: not at all, as of a file; or into chunks of a second as of the published stream, each after the
-``context`` of the speech before it as its authors meant, or after ``silence`` as the published code does."""
+CONTEXT_FRAMES = 64
+"""Frames that the published stream computes for each chunk of speech, the chunk's own among them."""
 
 
 @registry.model.register("LamAudio2Expression")
@@ -52,10 +49,6 @@ class LamAudio2Expression(DirectModel):
         num_heads: its attention heads.
         feed_forward_dim: channels between the two maps of its feed-forward layers; twice ``dim`` if None.
         dropout: on the features of speech and in the Transformer.
-        chunks: how speech is cut into the published stream's chunks.
-        finish: postprocessing of the weights, as names joined by ``+``: ``mouth`` (damped in silence),
-            ``smooth``, ``symmetric`` as published or ``halves`` as meant, and ``blinks``; see
-            :mod:`facediff.models.published.lam_postprocessing`.
         options: see :class:`~facediff.models.published.base.PublishedModel`, and of every model.
     """
 
@@ -76,15 +69,11 @@ class LamAudio2Expression(DirectModel):
         num_heads: Heads = 8,
         feed_forward_dim: Width | None = None,
         dropout: Share = 0.1,
-        chunks: Chunks = "none",
-        finish: str = "",
         **options: Any,  # noqa: ANN401
     ) -> None:
         super().__init__(**options)
         if transformer_layers:
             check_heads(dim=dim, num_heads=num_heads)
-        self.chunks: Chunks = chunks
-        self.finishing = Postprocessing.of(finish, self.space, self.frame_rate)
         self.network = LamNetwork(
             audio_width=self.audio_width,
             space=self.space,
@@ -115,44 +104,14 @@ class LamAudio2Expression(DirectModel):
         values: Tensor = self.network(features, weights, mask)
         return values * self.scale
 
-    def generate_frames(
-        self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
-    ) -> BatchMotion:
-        """All frames in one pass or chunk by chunk, then the chosen postprocessing."""
-        if self.chunks == "none" and not self.finishing.steps:
-            return super().generate_frames(batch, frames, seeds=seeds, progress=progress)
-        motion = batch.template.new_zeros(len(batch.audio), int(frames.max()), *batch.template.shape[1:])
-        for row, (count, seed) in enumerate(zip(frames.tolist(), seeds, strict=True)):
-            clip = batch.select([row])
-            speech = clip.audio[0, : int(clip.audio_lengths[0])]
-            finish = self.finishing.start(seed)
-            if self.chunks == "none":
-                raw = super().generate_frames(clip, frames[row : row + 1], seeds=[seed])[0]
-                processed = finish.whole(raw[..., 0].float().cpu().numpy(), speech.float().cpu().numpy())
-            else:
-                parts = self.stream_chunks(clip, SAMPLE_RATE, context=self.chunks == "context", finish=finish)
-                processed = np.concatenate(list(parts))[:count]
-            motion[row, : len(processed)] = torch.from_numpy(processed).to(motion).view(-1, *motion.shape[2:])
-        return motion
-
-    @property
-    def unexported(self) -> str:
-        """How speech is cut and what finishes the weights, if anything."""
-        chunks = f"chunks={self.chunks}" if self.chunks != "none" else ""
-        finish = f"finish={'+'.join(sorted(self.finishing.steps))}" if self.finishing.steps else ""
-        return " and ".join(filter(None, (chunks, finish)))
-
-    def stream_chunks(
-        self, clip: Batch, samples: int, *, context: bool, finish: PostprocessedRecording | None = None
-    ) -> Iterator[np.ndarray]:
+    def stream_chunks(self, clip: Batch, samples: int, *, context: bool) -> Iterator[Tensor]:
         """The published stream's output for each chunk of one clip's speech, (frames, coordinates).
 
         Args:
             clip: a batch of one clip.
-            samples: of a chunk.
+            samples: of a chunk; 16 000 in the published stream.
             context: compute each chunk after the speech before it; else after silence. The published code never notes
                 that the first chunk is over, so that each has silence before it.
-            finish: postprocessing of the weights of each chunk.
         """
         speech = clip.audio[0, : int(clip.audio_lengths[0])]
         window = SAMPLE_RATE * CONTEXT_FRAMES // 30
@@ -168,9 +127,8 @@ class LamAudio2Expression(DirectModel):
             # Rounded down as the published code does: a chunk of no whole number of frames gives one frame more.
             first = int(count - len(chunk) / SAMPLE_RATE * self.frame_rate)
             window_clip = with_speech(clip, sound, count)
-            motion = super().generate_frames(window_clip, window_clip.frame_lengths, seeds=[0])[0]
-            values = motion.flatten(1)[first:].detach().float().cpu().numpy()
-            yield values if finish is None else finish.chunk(values, chunk.float().cpu().numpy())
+            motion = self.generate_frames(window_clip, window_clip.frame_lengths, seeds=[0])[0]
+            yield motion.flatten(1)[first:].detach()
 
 
 class LamNetwork(nn.Module):

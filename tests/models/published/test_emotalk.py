@@ -5,22 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import math
-import random
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import soundfile
 import torch
-from scipy.signal import savgol_filter
 from torch import Tensor
 
 from facediff.animation.archives import read_animation
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.models import EmoTalk, import_checkpoint
-from facediff.models.published.emotalk import BLINKS, finished
 from facediff.spaces.layouts import layout
 from facediff.utils.licences import commercial_use
 from tests.fakes import published
@@ -122,31 +118,6 @@ def test_an_imported_model_is_of_arkits_channels_and_not_for_commerce(tmp_path: 
         import_checkpoint(tmp_path / "EmoTalk.pth", templates={})
     with pytest.raises(FaceDiffError, match="identities"):
         import_checkpoint(tmp_path / "EmoTalk.pth", identities=["one"])
-
-
-def test_finished_is_the_demonstration() -> None:
-    values = np.random.default_rng(0).random((400, 52)).astype(np.float32)
-    result = finished(values, frozenset({"smooth", "blinks"}), layout("arkit"), seed=3)
-    expected = np.stack([savgol_filter(values[:, column].astype(float), 5, 2) for column in range(52)], 1)
-    expected[:, 8:10] = 0
-    drawn = random.Random(3)  # noqa: S311 - no secret
-    start = drawn.randint(0, 60)
-    while start < 400 - 7:
-        expected[start : start + 7, 8:10] = BLINKS[drawn.randint(1, 4) - 1][:, None]
-        start += drawn.randint(60, 180)
-    np.testing.assert_allclose(result, expected, atol=1e-6)
-    assert (finished(values[:4], frozenset({"smooth"}), layout("arkit"), 0) == values[:4]).all()
-
-
-def test_finishing_is_an_option_of_the_import(tmp_path: Path) -> None:
-    state, speech = emotalk_state(), speech_of(205)
-    model = imported(state, tmp_path, finish="smooth")
-    expected = savgol_filter(reference(state, speech, 1, 2).numpy().astype(float), 5, 2, axis=0)
-    np.testing.assert_allclose(predict(model, speech, "2"), expected, atol=1e-5)
-    with pytest.raises(FaceDiffError, match=r"EmoTalk: finish=smooth cannot be exported"):
-        model.graphs()
-    with pytest.raises(FaceDiffError, match="smoth"):
-        imported(state, tmp_path, finish="smoth")
 
 
 def test_an_imported_checkpoint_animates_to_weights_and_to_the_built_in_face(tmp_path: Path) -> None:

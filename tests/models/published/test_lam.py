@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 
 from facediff.errors import FaceDiffError
 from facediff.models import LamAudio2Expression, import_checkpoint
-from facediff.models.published.lam_postprocessing import CONTEXT_FRAMES, Postprocessing, damp_mouth, loudness
+from facediff.models.published.lam import CONTEXT_FRAMES
 from facediff.spaces.layouts import layout
 from tests.models.published.conftest import MEL, TEXT
 
@@ -110,28 +109,18 @@ def test_parity(layers: int, prefix: str, tmp_path: Path) -> None:
 def test_the_published_stream(context: bool, tmp_path: Path) -> None:
     """Every chunk is the end of 64 frames: after the speech before it, or after silence as published."""
     reference, path = author(tmp_path, 0)
-    model = imported(path, chunks="context" if context else "silence")
-    speech, window = speech_of(40_000), 16_000 * CONTEXT_FRAMES // 30
-    parts = []
+    model, speech, window = imported(path), speech_of(40_000), 16_000 * CONTEXT_FRAMES // 30
+    expected = []
     for start in range(0, 40_000, 16_000):
         chunk = speech[start : start + 16_000]
         past = speech[:start] if context else speech[:0]
         heard = torch.cat([torch.zeros(window), past, chunk])[-window:]
-        parts.append(reference(heard, 1)[int(64 - len(chunk) / 16_000 * 30) :])
-    values = model.animate(speech, identity=model.identities[1]).vertices[..., 0]
-    torch.testing.assert_close(values, torch.cat(parts), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("rate", [25, 60])
-def test_chunks_fill_the_speech_at_other_frame_rates(rate: int, tmp_path: Path) -> None:
-    _, path = author(tmp_path, 0)
-    model, speech = imported(path, chunks="silence", frame_rate=rate), speech_of(40_000)
-    parts = [
-        model.stream_chunks(model.clip_of(part, "0", None), 16_000, context=False) for part in speech.split(16_000)
-    ]
-    whole = model.animate(speech, identity="0").vertices
-    assert [len(next(part)) for part in parts] == [rate, rate, math.ceil(rate / 2)]
-    assert whole[-1].any()
+        expected.append(reference(heard, 1)[int(64 - len(chunk) / 16_000 * 30) :])
+    parts = list(model.stream_chunks(model.clip_of(speech, "1", None), 16_000, context=context))
+    torch.testing.assert_close(torch.cat(parts), torch.cat(expected), rtol=0, atol=1e-5)
+    model.frame_rate = 25.0  # chunks fill the speech at other rates too
+    parts = list(model.stream_chunks(model.clip_of(speech, "1", None), 16_000, context=context))
+    assert [len(part) for part in parts] == [25, 25, 13]
 
 
 def test_hyperparameters_come_from_one_file(tmp_path: Path) -> None:
@@ -161,86 +150,3 @@ def test_channels_of_a_range_are_bounded_and_rotations_are_not() -> None:
     assert values[:, list(space.face)].amax() <= 1
     turns = [*space.head, *space.eyes]
     assert values[:, turns].abs().amax() > 1
-
-
-# What is done with the weights afterwards.
-
-SPACE = layout("arkit")
-
-
-def weights(frames: int) -> np.ndarray:
-    return np.random.default_rng(3).random((frames, 52)).astype(np.float32)
-
-
-def test_loudness_is_the_root_mean_square_around_the_begin_of_a_frame() -> None:
-    speech = speech_of(5000).numpy()
-    volume = loudness(speech, 30.0)
-    assert len(volume) == 10
-    around = speech[3 * 533 - 266 : 3 * 533 + 267]
-    assert volume[3] == pytest.approx(math.sqrt(np.mean(around.astype(float) ** 2)), rel=1e-5)
-
-
-def test_silence_damps_the_mouth_alone() -> None:
-    values, volume = weights(30), np.ones(30, np.float32)
-    volume[10:20] = 0
-    mouth = Postprocessing.of("mouth", SPACE, 30.0).start(0).mouth
-    damped = damp_mouth(values.copy(), volume, mouth)
-    np.testing.assert_allclose(damped[13:17, mouth], 0.1 * values[13:17, mouth], rtol=1e-6)
-    others = sorted({*range(52)} - {*mouth})
-    np.testing.assert_array_equal(damped[13:17, others], values[13:17, others])
-    np.testing.assert_array_equal(damped[:10], values[:10])
-    # The first silent frame: a quarter of itself and three quarters of the frame before it.
-    expected = 0.75 * values[9, mouth] + 0.25 * 0.1 * values[10, mouth]
-    np.testing.assert_allclose(damped[10, mouth], expected, rtol=1e-5)
-    volume[10:20], volume[3:10] = 1, 0  # seven frames are too few for the first run
-    np.testing.assert_array_equal(damp_mouth(values.copy(), volume, mouth), values)
-
-
-@pytest.mark.parametrize(("step", "sideways"), [("symmetric", True), ("halves", False)])
-def test_left_and_right_are_averaged(step: str, sideways: bool) -> None:
-    values = weights(5)
-    finished = Postprocessing.of(step, SPACE, 30.0).start(0).whole(values, speech_of(2500).numpy())
-    for left, right, averaged in (("mouthSmileLeft", "mouthSmileRight", True), ("jawLeft", "jawRight", sideways)):
-        pair = [SPACE.index(left), SPACE.index(right)]
-        expected = values[:, pair].mean(1, keepdims=True).repeat(2, 1) if averaged else values[:, pair]
-        np.testing.assert_allclose(finished[:, pair], expected, rtol=1e-6)
-
-
-def test_blinks_follow_numpys_seed() -> None:
-    finished = Postprocessing.of("blinks", SPACE, 30.0).start(7).whole(weights(20), speech_of(10_500).numpy())
-    np.random.seed(7)  # noqa: NPY002 - what the published code draws from
-    scale, row = np.random.uniform(0.8, 1.0), np.random.randint(0, 4)  # noqa: NPY002
-    lids = finished[:, [8, 9]]
-    assert lids[:7].max() == pytest.approx(scale * (0.956, 0.945, 0.95, 0.953)[row])
-    assert not lids[7:].any()
-
-
-def test_a_parabola_is_left_as_it_is_and_a_stream_leads_away_from_what_was_given() -> None:
-    time = np.arange(20)[:, None] / 20
-    parabola = (0.2 + 0.5 * time * (1 - time)).repeat(52, 1).astype(np.float32)
-    finished = Postprocessing.of("smooth", SPACE, 30.0).start(0).whole(parabola, speech_of(10_600).numpy())
-    np.testing.assert_allclose(finished[2:-2], parabola[2:-2], atol=1e-6)
-    finish = Postprocessing.of("smooth", SPACE, 30.0).start(0)
-    one = finish.chunk(np.full((30, 52), 0.8, np.float32), speech_of(16_000).numpy())
-    other = finish.chunk(np.full((30, 52), 0.2, np.float32), speech_of(16_000).numpy())
-    assert one[0, 0] < 0.5  # from rest
-    assert other[0, 0] > 0.5
-    np.testing.assert_allclose(other[10:], 0.2, atol=1e-6)
-
-
-def test_finishing_is_for_arkit(tmp_path: Path) -> None:
-    _, path = author(tmp_path, 0)
-    with pytest.raises(FaceDiffError, match="brows"):
-        imported(path, finish="mouth+brows")
-    with pytest.raises(FaceDiffError, match="finish"):
-        LamAudio2Expression(
-            n_vertices=9, identities=["A"], frame_rate=30.0, audio_encoder=MEL, audio_dim=8, finish="smooth"
-        )
-
-
-@pytest.mark.parametrize("option", [{"finish": "blinks+smooth"}, {"chunks": "context"}], ids=str)
-def test_what_no_graph_does_is_named_before_anything_is_recorded(option: dict[str, str], tmp_path: Path) -> None:
-    model = imported(author(tmp_path, 0)[1], **option)
-    ((name, value),) = option.items()
-    with pytest.raises(FaceDiffError, match=rf"{name}={re.escape(value)} cannot be exported"):
-        model.graphs()
