@@ -87,7 +87,7 @@ def test_defaults_of_whole_tables(page: str, head: str, owner: Owner) -> None:
         ("SelfTalk", "SelfTalk", 6),
         ("TalkingStyle", "TalkingStyle", 2),
         ("VOCA", "Voca", 3),
-        ("LAM-Audio2Expression", "LamAudio2Expression", 2),
+        ("LAM-Audio2Expression", "LamAudio2Expression", 1),
         ("UniTalker", "UniTalker", 2),
     ],
 )

@@ -28,7 +28,7 @@ from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStrea
 from facediff.models.layers import Heads, Layers, Width, check_heads
 from facediff.models.published.artalk_codec import BitCodec, Bits, resized
 from facediff.models.published.clip_style import read_table
-from facediff.models.published.parametric import ParametricModel, PieceStream, window_at
+from facediff.models.published.parametric import ParametricModel, window_at
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
@@ -357,7 +357,7 @@ class ARTalk(ParametricModel):
         return motion
 
 
-class ChunkStream(PieceStream):
+class ChunkStream(SpeechStream):
     """Animates speech that arrives in pieces, chunk by chunk: the very frames that the whole recording gives.
 
     A frame is certain four seconds and four frames later at most: a chunk, and half of the longest filter.
@@ -378,15 +378,18 @@ class ChunkStream(PieceStream):
         with torch.inference_mode():
             self._token = model.style_token(self.clip)
             self._state = model.begin(self._token)
-        self._wave = self._token.new_zeros(0)
+        self._wave = self._token.new_zeros(0)  # speech that is not animated yet, shorter than a chunk
         self._raw = self._token.new_zeros(0, model.coordinates)  # not smoothed yet
         self._first = 0  # the frame that it begins with
 
     @torch.inference_mode()
     def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
         """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames."""
-        for chunk in self._pieces(samples, self.model.chunk_samples):
-            self._next(chunk, self.model.scales[-1])
+        self._refuse_finished()
+        self._wave, size = torch.cat([self._wave, torch.as_tensor(samples).to(self._wave)]), self.model.chunk_samples
+        while len(self._wave) >= size:
+            self._next(self._wave[:size], self.model.scales[-1])
+            self._wave = self._wave[size:]
         end = min(self._first + len(self._raw), self._spoken)
         certain = end - LONGEST_FILTER // 2 if end >= LONGEST_FILTER else 0
         return self._given(certain if self.model.smooth else end, end)
@@ -401,7 +404,7 @@ class ChunkStream(PieceStream):
         if last > end:
             self._next(F.pad(self._wave, (0, size - len(self._wave))), last - end)
         self._raw = self._raw[: last - self._first]
-        count = self._left(last, frames)
+        count = self._total(last, frames) - self.frames
         motion = self._given(last, last)[:, :count]
         return F.pad(motion, (0, 0, 0, 0, 0, count - motion.shape[1]))
 

@@ -4,7 +4,7 @@ Sun et al.: "DiffPoseTalk: Speech-Driven Stylistic 3D Facial Animation and Head 
 2024.
 
 Diffusion over windows of FLAME's parameters, each of which continues the one before it; the style comes from a clip.
-From top to bottom: the model, training, sampling, streams, the authors' files. The network and the process stand in
+From top to bottom: the model, training, sampling, the authors' files. The network and the process stand in
 ``diffposetalk_network.py``; docs/methods.md lists the options for choices of the published code.
 """
 
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -27,7 +26,7 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.errors import ArgumentError, OptionError, check_known
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import BatchMotion, Motion, Progress, SpeechStream
+from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, check_heads
 from facediff.models.published.cards import AuthorFiles, Facts
 from facediff.models.published.clip_style import read_table, style_contrast
@@ -42,11 +41,10 @@ from facediff.models.published.diffposetalk_network import (
 )
 from facediff.models.published.diffusion import PosteriorSampler, SeededNoise
 from facediff.models.published.import_options import ImportOptions
-from facediff.models.published.parametric import ParametricModel, PieceStream, statistics_of, window_at
+from facediff.models.published.parametric import ParametricModel, statistics_of, window_at
 from facediff.models.samplers import NoiseSource
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces.layouts import layout
-from facediff.speech.windows import WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import open_array, read_arrays
 from facediff.utils.hints import check_number
@@ -324,36 +322,12 @@ class DiffPoseTalk(ParametricModel):
         style, shapes = self.given_style(batch), self.shapes_of(batch)
         rows = []
         for i, seed in enumerate(seeds):
-            audio, draw = batch.audio[i, : int(batch.audio_lengths[i])], self.noise_of(seed)
+            audio = batch.audio[i, : int(batch.audio_lengths[i])]
+            draw = SeededNoise([self.window_frames], [seed], self.device)
             motion = self.sample(audio, shapes[i : i + 1], None if style is None else style[i : i + 1], draw, progress)
             rows.append(self.absolute(motion))
         motion = nn.utils.rnn.pad_sequence(rows, batch_first=True)
         return F.pad(motion, (0, 0, 0, 0, 0, max(0, int(frames.max()) - motion.shape[1])))[:, : int(frames.max())]
-
-    def noise_of(self, seed: int) -> SeededNoise:
-        """The noise of a seed, the same for every clip."""
-        return SeededNoise([self.window_frames], [seed], self.device)
-
-    @property
-    def window_samples(self) -> int:
-        """Samples of a window's speech."""
-        return round(SAMPLE_RATE / self.frame_rate * self.window_frames)
-
-    @property
-    def stream_timing(self) -> tuple[float, float] | None:
-        """A window each, unless others were chosen; see the base class."""
-        window = self.window_frames / self.frame_rate
-        return (window, window) if math.isinf(self.windows.above) else None
-
-    def stream(self, *, plan: WindowPlan | None = None, **choices: Any) -> SpeechStream:  # noqa: ANN401
-        """Animate speech of any length while it arrives, in the method's own windows; see the base class.
-
-        Where other windows were chosen, such as low latency's, speech is cut into these.
-        """
-        stream = super().stream(plan=plan, **choices)
-        if not math.isinf((plan or self.windows).above):
-            return stream
-        return WindowStream(self, stream.clip, seeds=stream.seeds, plan=plan)
 
     def sample(
         self,
@@ -379,7 +353,7 @@ class DiffPoseTalk(ParametricModel):
         size, unit = self.window_frames, SAMPLE_RATE / self.frame_rate
         audio = self.standard_speech(audio)
         windows = max(1, math.ceil(self.frames_of(len(audio)) / size))
-        padding = self.window_samples * windows - len(audio)
+        padding = round(unit * size) * windows - len(audio)
         if padding > 0:
             audio = F.pad(audio, (0, padding))
         filled = max(0, math.ceil(padding / unit))
@@ -434,80 +408,6 @@ class DiffPoseTalk(ParametricModel):
             return guided(predicted[:, self.context :].split(1), scales, self.guidance)
 
         return PosteriorSampler(self.process).run(denoise, start, noise=draw)
-
-
-class WindowStream(PieceStream):
-    """Animates speech that arrives in pieces in the method's own windows, each of which continues the one before it.
-
-    A frame is certain a window after its moment at most. Of a recording as a whole the speech network hears all windows
-    in one pass and standardises them by the level of all; here it hears each by itself, at the level of the speech so
-    far, since later speech is not known yet.
-
-    Args:
-        model: the animating model.
-        clip: as :class:`~facediff.models.inference.SpeechStream` takes it.
-        seeds: as there.
-        plan: as there; the windows are the model's own.
-    """
-
-    model: DiffPoseTalk
-
-    def __init__(
-        self, model: DiffPoseTalk, clip: Batch, *, seeds: Sequence[int] = (0,), plan: WindowPlan | None = None
-    ) -> None:
-        super().__init__(model, clip, seeds=seeds, plan=plan)
-        with torch.inference_mode():
-            self._style, self._shape = model.given_style(self.clip), model.shapes_of(self.clip)
-        self._draws = [model.noise_of(seed) for seed in self.seeds]
-        like = self._shape.new_empty(1, model.window_frames, len(model.modelled))
-        self._starts = [draw(like) for draw in self._draws]
-        self._before: list[tuple[Tensor, Tensor]] = [(model.start_motion, model.start_audio) for _ in self.seeds]
-        self._wave = self._shape.new_zeros(0)
-        self._sums = (0, 0.0, 0.0)  # samples of all speech so far, their sum and that of their squares
-
-    @torch.inference_mode()
-    def feed(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32]) -> Motion:
-        """Take more speech at 16 kHz, and return the motion that it makes final; it may have no frames."""
-        model = self.model
-        return self._counted(
-            [self._next(piece, model.window_frames) for piece in self._pieces(samples, model.window_samples)]
-        )
-
-    @torch.inference_mode()
-    def finish(self, frames: int | None = None) -> Motion:
-        """Give the motion that is left; arguments and errors as in the base class."""
-        self._refuse_finished()
-        self._finished = True
-        # By rounding, all of the speech may last a frame less than its windows.
-        left = max(0, self.model.frames_of(self._sums[0] + len(self._wave)) - self.frames)
-        count = self._left(self.frames + left, frames)
-        motion = self._counted([self._next(self._wave, left)[:, :count]] if left else [])
-        return F.pad(motion, (0, 0, 0, 0, 0, count - motion.shape[1]))
-
-    def _next(self, wave: Float[Tensor, " samples"], frames: int) -> Motion:
-        """The motion of the next window, of which so many frames are of speech."""
-        model, (count, total, squares) = self.model, self._sums
-        numbers = wave.double()
-        # The authors bring a whole recording to one level; of a stream only the level of the speech so far is known.
-        self._sums = (count + len(wave), total + float(numbers.sum()), squares + float(numbers.square().sum()))
-        mean, deviation = level_of(*self._sums)
-        wave = F.pad((wave - mean) / deviation, (0, model.window_samples - len(wave)))
-        speech = model.encode_wave(wave, model.window_frames)[None]
-        mask = wave.new_ones(1, model.window_frames)
-        mask[:, frames:] = 0
-        motions = []
-        for number, (draw, start) in enumerate(zip(self._draws, self._starts, strict=True)):
-            before = self._before[number]
-            motion = model.sample_window(speech, self._shape, self._style, before, start, mask, draw)
-            self._before[number] = (motion[:, -model.context :], speech[:, -model.context :])
-            motions.append(model.absolute(motion[0, :frames]))
-        return torch.stack(motions)
-
-
-def level_of(count: int, total: float, squares: float) -> tuple[float, float]:
-    """Mean of speech and its deviation + 1e-5, from the number of samples, their sum and the sum of their squares."""
-    mean = total / count
-    return mean, math.sqrt(max(0.0, squares - count * mean**2) / max(1, count - 1)) + 1e-5
 
 
 def fitted(wave: Float[Tensor, " samples"]) -> Float[Tensor, " padded"]:

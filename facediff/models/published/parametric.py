@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any, ClassVar
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -16,7 +14,7 @@ from facediff.data import Batch, Reference, SpeechMotionDataModule
 from facediff.errors import OptionError
 from facediff.models.checkpoint_content import PersonStyles
 from facediff.models.evaluation import IdentityPolicy
-from facediff.models.inference import SpeechStream, Style
+from facediff.models.inference import Style
 from facediff.models.layers import Heads, Layers, Width, check_heads
 from facediff.models.published.base import NO_STYLE, PublishedModel
 from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder
@@ -170,22 +168,3 @@ def statistics_of(content: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Te
             f"above 0, as the authors' file has them"
         )
     return mean, deviation
-
-
-class PieceStream(SpeechStream):
-    """Animates speech that arrives in a method's own pieces of one length, instead of facediff's windows."""
-
-    _wave: Float[Tensor, " samples"]
-    """Speech that is not animated yet, shorter than a piece; set by the constructors below."""
-
-    def _pieces(self, samples: Float[Tensor, " samples"] | npt.NDArray[np.float32], size: int) -> Iterator[Tensor]:
-        """The pieces of so many samples that are whole with more speech."""
-        self._refuse_finished()
-        self._wave = torch.cat([self._wave, torch.as_tensor(samples).to(self._wave)])
-        while len(self._wave) >= size:
-            piece, self._wave = self._wave[:size], self._wave[size:]
-            yield piece
-
-    def _left(self, end: int, frames: int | None) -> int:
-        """Frames to give out at the end, of all that the speech has or of so many."""
-        return self._total(end, frames) - self.frames

@@ -128,47 +128,8 @@ def test_animation_is_parameters_of_flame(tmp_path: Path) -> None:
     assert not torch.allclose(plain, by_clip)
 
 
-@pytest.mark.parametrize("pieces", [[5000, 9900], [14_900], [640] * 24])
-def test_stream_is_the_file_in_the_same_windows(
-    pieces: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of speech whose level is known and that is heard window by window, not a bit differs."""
-    model, audio = imported(tmp_path), speech(2.33 * 10)
-    model.speech_context = False
-    # Both then have the same level: a file's is that of all of it, a stream's that of what was heard so far.
-    monkeypatch.setattr(DiffPoseTalk, "standard_speech", staticmethod(lambda wave: wave))
-    monkeypatch.setattr("facediff.models.published.diffposetalk.level_of", lambda count, total, squares: (0.0, 1.0))
-    clip = Reference("clip", torch.randn(12, 56, 1, generator=torch.Generator().manual_seed(4)))
-    whole = model.animate(audio, identity="A", style=clip, seed=5).vertices
-    stream = model.stream(identity="A", style=clip, seeds=(5,))
-    parts = [stream.feed(part) for part in audio.split(pieces[0])]
-    assert sum(part.shape[1] for part in parts) == len(audio) // model.window_samples * model.window_frames
-    parts.append(stream.finish())
-    assert torch.equal(torch.cat(parts, 1)[0], whole)
-
-
-def test_stream_may_end_with_a_window(tmp_path: Path) -> None:
-    model = imported(tmp_path)
-    model.frame_rate = 29.97 * model.window_frames / 12  # the samples of a window are rounded down
-    assert model.frames_of(model.window_samples) == model.window_frames - 1
-    stream = model.stream(identity="A")
-    given = stream.feed(0.1 * torch.randn(model.window_samples)).shape[1]
-    assert (given, stream.finish().shape[1]) == (model.window_frames, 0)
-
-
-def test_stream_hears_at_the_level_of_the_speech_so_far(tmp_path: Path) -> None:
-    model, audio = imported(tmp_path), speech(30)
-    first, louder = (model.stream(identity="A") for _ in range(2))
-    quiet = first.feed(audio[: model.window_samples])
-    assert torch.allclose(quiet, louder.feed(3 * audio[: model.window_samples]), atol=1e-3)
-
-
-def test_chosen_windows_are_followed(tmp_path: Path) -> None:
-    model = imported(tmp_path)
-    assert type(model.stream(identity="A")).__name__ == "WindowStream"
-    assert not model.has_sampler("dpm_solver")
-    model.choose_low_latency()
-    assert type(model.stream(identity="A")).__name__ == "SpeechStream"
+def test_no_registered_sampler_is_taken(tmp_path: Path) -> None:
+    assert not imported(tmp_path).has_sampler("dpm_solver")
 
 
 @pytest.mark.parametrize(
