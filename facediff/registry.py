@@ -22,7 +22,7 @@ import sys
 import threading
 import types
 import warnings
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
@@ -157,29 +157,24 @@ class Kind:
             raise UnknownComponentError(self.unknown(name))
         return self._entries[name].implementation
 
-    def read(self, text: str, hidden: Set[str] = frozenset()) -> tuple[str, dict[str, Any]]:
+    def read(self, text: str) -> tuple[str, dict[str, Any]]:
         """The name and the options of ``NAME:option=value,option=value``; see :meth:`options`."""
         text = text.replace(" ", "")
         name, _, rest = text.partition(":")
         parts = (word.partition("=") for word in filter(None, rest.split(",")))
         pairs = [(option, value) for option, _, value in parts]
-        return name, self.options(name, pairs, f"{self.kind} {text}", hidden)
+        return name, self.options(name, pairs, f"{self.kind} {text}")
 
-    def options(
-        self, name: str, pairs: Sequence[tuple[str, str]], source: str, hidden: Set[str] = frozenset()
-    ) -> dict[str, Any]:
+    def options(self, name: str, pairs: Sequence[tuple[str, str]], source: str) -> dict[str, Any]:
         """The options of a component as its constructor takes them.
 
         Args:
             name: of the component.
             pairs: options and their values, as typed.
             source: the name of their option in errors.
-            hidden: options that cannot be chosen this way.
         """
         component = self.get(name)
-        names = inspect.signature(component).parameters.keys() - hidden
-        parameters = {option: p for option, p in hints.options_of(component).items() if option in names}
-        parameters = {option: p for option, p in parameters.items() if p.default is not p.empty}
+        parameters = {name: p for name, p in hints.options_of(component).items() if p.default is not p.empty}
         options = {}
         for option, value in pairs:
             if option not in parameters:

@@ -7,12 +7,11 @@ in streams alike; and faults of recordings (:func:`speech_problems`).
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from pathlib import Path
+from functools import partial
 from typing import Annotated, Any, cast
 
 import numpy as np
@@ -105,6 +104,7 @@ class VoiceGate(ABC):
     look_ahead: int = 0
     """Steps after one that the detector hears before it decides."""
 
+    @partial(checks_arguments, path="voice gate")
     def __init__(
         self, *, attack: Seconds = 0.1, lead: Seconds = 0.12, hold: Seconds = 0.1, release: Seconds = 0.15
     ) -> None:
@@ -165,26 +165,19 @@ class EnergyGate(VoiceGate):
 
     Args:
         margin: decibels above the noise at which speech begins.
-        attack: seconds in which the gate opens.
-        lead: seconds before speech at which it is open, since a mouth moves before it is heard.
-        hold: seconds after speech for which it stays open.
-        release: seconds in which it closes.
         ahead: seconds that are heard ahead; without them, the first sound after a start is taken for speech.
+        timing: options of :class:`VoiceGate`.
     """
 
     def __init__(
         self,
         *,
         margin: Annotated[float, Range(1, 40)] = 8.0,
-        attack: Seconds = 0.1,
-        lead: Seconds = 0.12,
-        hold: Seconds = 0.1,
-        release: Seconds = 0.15,
         ahead: Seconds = 0.7,
+        **timing: Any,  # noqa: ANN401
     ) -> None:
-        super().__init__(attack=attack, lead=lead, hold=hold, release=release)
-        self.margin = margin
-        self.ahead = ahead
+        super().__init__(**timing)
+        self.margin, self.ahead = margin, ahead
         self.look_ahead = round(ahead * 100)
 
     def listener(self) -> Listener:
@@ -296,22 +289,11 @@ class WebRtcGate(VoiceGate):
 
     Args:
         strictness: 0 takes most for speech, 3 least.
-        attack: seconds in which the gate opens.
-        lead: seconds before speech at which it is open, since a mouth moves before it is heard.
-        hold: seconds after speech for which it stays open.
-        release: seconds in which it closes.
+        timing: options of :class:`VoiceGate`.
     """
 
-    def __init__(
-        self,
-        *,
-        strictness: Annotated[int, Range(0, 3)] = 2,
-        attack: Seconds = 0.1,
-        lead: Seconds = 0.12,
-        hold: Seconds = 0.1,
-        release: Seconds = 0.15,
-    ) -> None:
-        super().__init__(attack=attack, lead=lead, hold=hold, release=release)
+    def __init__(self, *, strictness: Annotated[int, Range(0, 3)] = 2, **timing: Any) -> None:  # noqa: ANN401
+        super().__init__(**timing)
         with needs_extra("webrtcvad", "voice", "the voice gate webrtc"):
             import webrtcvad
         self.strictness = strictness
@@ -339,115 +321,6 @@ class _WebRtcListener(Listener):
     def finish(self) -> list[bool]:
         """Nothing waits."""
         return []
-
-
-@voice_gate.register("silero")
-class SileroGate(EnergyGate):
-    """Speech rises above the noise, as for ``energy``, and Silero's network hears a voice: music is none.
-
-    The network (Silero team, MIT, 2.3 MB) comes with ``pip install --no-deps silero-vad`` (5 or 6).
-
-    Args:
-        margin: decibels above the noise at which speech begins.
-        attack: seconds in which the gate opens.
-        lead: seconds before speech at which it is open, since a mouth moves before it is heard.
-        hold: seconds after speech for which it stays open.
-        release: seconds in which it closes.
-        ahead: seconds that are heard ahead to estimate the noise.
-        threshold: probability above which there is a voice.
-        model: path of silero_vad.onnx; that of the installed package if empty.
-    """
-
-    def __init__(
-        self,
-        *,
-        margin: Annotated[float, Range(1, 40)] = 8.0,
-        attack: Seconds = 0.1,
-        lead: Seconds = 0.12,
-        hold: Seconds = 0.1,
-        release: Seconds = 0.15,
-        ahead: Seconds = 0.7,
-        threshold: Annotated[float, Range(0, 1)] = 0.5,
-        model: str = "",
-    ) -> None:
-        super().__init__(margin=margin, attack=attack, lead=lead, hold=hold, release=release, ahead=ahead)
-        self.threshold = threshold
-        self.look_ahead = max(self.look_ahead, math.ceil(SILERO_CHUNK / HOP))
-        self.model = Path(model).expanduser() if model else installed_silero()
-        if not self.model.is_file():
-            raise FaceDiffError(
-                f"voice gate silero: {self.model} is not there; `pip install --no-deps silero-vad`, or give "
-                f"silero:model=FILE"
-            )
-
-    def listener(self) -> Listener:
-        """A detector at the beginning of a recording."""
-        return _SileroListener(self)
-
-
-def installed_silero() -> Path:
-    """Where the package silero-vad has its network; it is not imported, since that takes PyTorch and torchaudio."""
-    spec = importlib.util.find_spec("silero_vad")
-    folders = [] if spec is None else list(spec.submodule_search_locations or [])
-    return Path(folders[0] if folders else ".") / "data" / "silero_vad.onnx"
-
-
-SILERO_CHUNK, SILERO_CONTEXT = 512, 64
-"""Samples that the network hears at a time, and those before them that it hears again."""
-
-
-class _SileroListener(Listener):
-    """A step is speech if it is for the level, and for the network in the chunk of the step's middle."""
-
-    def __init__(self, gate: SileroGate) -> None:
-        import onnxruntime  # type: ignore[import-untyped]
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self.gate = gate
-        self._level = _EnergyListener(gate)
-        self._network = onnxruntime.InferenceSession(gate.model, options, providers=["CPUExecutionProvider"])
-        self._state = np.zeros((2, 1, 128), np.float32)
-        self._context = np.zeros(SILERO_CONTEXT, np.float32)
-        self._unheard = np.zeros(0, np.float32)  # samples that fill no chunk yet
-        self._loud: deque[bool] = deque()  # steps that the network has not decided on
-        self._voiced: list[bool] = []  # chunks, the first of which is the one of the first step that waits
-        self._steps = self._chunks = 0  # steps that were decided on, and chunks that were dropped
-
-    def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
-        """Decide on the steps of which level and network are known."""
-        self._loud += self._level.hear(steps)
-        self._unheard = np.concatenate([self._unheard, steps.reshape(-1).astype(np.float32)])
-        while len(self._unheard) >= SILERO_CHUNK:
-            chunk, self._unheard = self._unheard[:SILERO_CHUNK], self._unheard[SILERO_CHUNK:]
-            self._voiced.append(self._probability(chunk) >= self.gate.threshold)
-        return self._decided()
-
-    def finish(self) -> list[bool]:
-        """Decide on all that is left, as if silence followed."""
-        self._loud += self._level.finish()
-        if len(self._unheard):
-            rest = np.pad(self._unheard, (0, SILERO_CHUNK - len(self._unheard)))
-            self._voiced.append(self._probability(rest) >= self.gate.threshold)
-        return self._decided()
-
-    def _probability(self, chunk: npt.NDArray[np.float32]) -> float:
-        heard = np.concatenate([self._context, chunk])
-        self._context = heard[-SILERO_CONTEXT:]
-        feeds = {"input": heard[None], "state": self._state, "sr": np.array(SAMPLE_RATE, np.int64)}
-        probability, self._state = self._network.run(None, feeds)
-        return float(np.asarray(probability).item())
-
-    def _decided(self) -> list[bool]:
-        decisions = []
-        while self._loud and (chunk := (self._steps * HOP + HOP // 2) // SILERO_CHUNK - self._chunks) < len(
-            self._voiced
-        ):
-            decisions.append(self._loud.popleft() and self._voiced[chunk])
-            self._steps += 1
-        drop = min((self._steps * HOP + HOP // 2) // SILERO_CHUNK - self._chunks, len(self._voiced))
-        self._voiced, self._chunks = self._voiced[drop:], self._chunks + drop
-        return decisions
 
 
 class Openness:
@@ -540,9 +413,6 @@ NOISY = 25.0
 PART = SAMPLE_RATE // 20
 """Samples of a part whose loudness counts."""
 
-TONAL = 0.1
-"""Spectral flatness of what goes on in pauses below which it is music or hum, and above which it is hiss."""
-
 
 def speech_problems(speech: Wave) -> list[str]:
     """Faults of a recording (S,) at 16 kHz, each in a few words; empty if it has none.
@@ -558,22 +428,11 @@ def speech_problems(speech: Wave) -> list[str]:
     problems = []
     if _clipped(speech, 0.998 * peak) > CLIPPED:
         problems.append("is clipped: its loudest samples are cut off; record it at a lower level")
-    if len(speech) < 10 * PART:
-        return problems
-    parts = speech[: len(speech) // PART * PART].reshape(-1, PART)
-    levels, soft = _levels(parts)
-    apart = float(np.percentile(levels, 80) - levels[soft].mean())
-    if apart < NOISY:
-        power = (
-            np.square(np.abs(np.fft.rfft(parts[soft].astype(np.float64) * np.hanning(PART), axis=1)))[:, 4:-8].mean(0)
-            + 1e-12
-        )
-        flatness = float(np.exp(np.log(power).mean()) / power.mean())
-        what = "hiss or other noise" if flatness > TONAL else "music, hum or another steady sound"
-        if apart < 6:
-            problems.append(f"holds {what} from beginning to end and perhaps no speech")
-        else:
-            problems.append(f"has {what} {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
+    apart = loudness_range(speech) if len(speech) >= 10 * PART else NOISY
+    if apart < 6:
+        problems.append("holds noise from beginning to end and perhaps no speech")
+    elif apart < NOISY:
+        problems.append(f"has noise {apart:.0f} dB below the speech; a cleaner recording moves the lips better")
     return problems
 
 
@@ -581,22 +440,17 @@ def loudness_range(speech: Wave) -> float:
     """Decibels between the loud parts of a recording (S,) at 16 kHz and its pauses; below 0 where it is silent."""
     if len(speech) < PART or float(np.abs(speech).max()) < 1e-4:
         return -1.0
-    levels, soft = _levels(speech[: len(speech) // PART * PART].reshape(-1, PART))
-    return float(np.percentile(levels, 80) - levels[soft].mean())
-
-
-def _levels(parts: Wave) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.intp]]:
-    """Decibels of parts (n, PART), and the softest of them."""
-    powers = [
+    parts = speech[: len(speech) // PART * PART].reshape(-1, PART)
+    powers = [  # by the minute, since speech may last hours
         np.square(some - some.mean(1, keepdims=True)).mean(1)
-        for some in (np.asarray(parts[first : first + 1000], np.float64) for first in range(0, len(parts), 1000))
+        for some in (np.asarray(parts[first : first + 1200], np.float64) for first in range(0, len(parts), 1200))
     ]
-    levels = 10 * np.log10(np.concatenate(powers) + 1e-12)
-    return levels, np.argsort(levels)[: max(4, len(parts) // 20)]
+    levels = np.sort(10 * np.log10(np.concatenate(powers) + 1e-12))
+    return float(np.percentile(levels, 80) - levels[: max(4, len(parts) // 20)].mean())
 
 
 def _clipped(speech: Wave, level: float) -> float:
-    """The share of samples at which three in a row reach a level; by the minute, since speech may last hours."""
+    """The share of samples at which three in a row reach a level; by the minute as well."""
     runs, piece = 0, 60 * SAMPLE_RATE
     for first in range(0, len(speech), piece):
         top = np.abs(speech[first : first + piece + 2]) >= level
