@@ -34,7 +34,7 @@ class BatchOptions:
     Attributes:
         suffix: format of the batch's outputs
         workers: recordings at a time (default: one for each processor)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        scheduler: where tasks run: processes, threads, or tcp://HOST:PORT of a Dask cluster (docs/cluster.md)
         retry_failed: try recordings again that failed before
     """
 

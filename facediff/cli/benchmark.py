@@ -50,7 +50,7 @@ def benchmark(
         output: folder for benchmarks; each plan gets one of its name below it
         root: folder of one of the plan's corpora; repeatable
         workers: cells at a time (default: the plan's, or as many as processors allow)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        scheduler: where tasks run: processes, threads, or tcp://HOST:PORT of a Dask cluster (docs/cluster.md)
         retry_failed: try cells again that failed
         dry_run: list the cells that would run, with times by the last timings
     """

@@ -169,7 +169,7 @@ class MapOptions:
         highest_mean: end of the mean's scale in the unit shown
         view: camera
         workers: clips read at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        scheduler: where tasks run: processes, threads, or tcp://HOST:PORT of a Dask cluster (docs/cluster.md)
     """
 
     clips: Annotated[list[str] | None, Option(metavar="CLIP", many=True)] = None

@@ -57,7 +57,7 @@ class WorkOptions:
 
     Attributes:
         workers: clips or videos at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, tcp://HOST:PORT of a Dask cluster, or slurm (docs/cluster.md)
+        scheduler: where tasks run: processes, threads, or tcp://HOST:PORT of a Dask cluster (docs/cluster.md)
         quiet: no progress bars
     """
 

@@ -16,12 +16,8 @@ import os
 import pickle  # noqa: S403 - what a run sends its own workers, over the connection that Dask itself sends pickles by
 import platform
 import queue
-import re
 import secrets
-import shutil
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 import warnings
@@ -34,7 +30,8 @@ from typing import Any, TypeVar
 
 from facediff.errors import FaceDiffError, damaged
 from facediff.utils.files import scratch_folder
-from facediff.utils.workers import GRACE, SLURM, WorkerDied, one_thread_each
+from facediff.utils.limits import brief
+from facediff.utils.workers import GRACE, WorkerDied, one_thread_each
 from facediff.version import __version__
 
 Task = TypeVar("Task")
@@ -66,11 +63,7 @@ class ClusterRun:
 
 
 def fingerprint(path: str) -> int | tuple[str, ...] | None:
-    """The fingerprint of a path, by which another machine finds out whether it sees the same.
-
-    Returns:
-        a file's size, a few names out of a folder, which may get more meanwhile, or None if there is nothing.
-    """
+    """A file's size, or a few names out of a folder, by which another machine finds out whether it sees the same."""
     try:
         if not os.path.isdir(path):
             return os.stat(path).st_size
@@ -81,7 +74,7 @@ def fingerprint(path: str) -> int | tuple[str, ...] | None:
 
 
 def matches(path: str, expected: object) -> bool:
-    """Whether what :func:`fingerprint` has found on another machine is here as well."""
+    """Whether a path has a :func:`fingerprint` that another machine has found; a folder may have more by now."""
     if isinstance(expected, tuple):
         return os.path.isdir(path) and all(os.path.lexists(os.path.join(path, name)) for name in expected)
     return fingerprint(path) == expected
@@ -99,23 +92,14 @@ def run_on_cluster(
     writes: Path | None = None,
     reads: Iterable[Path] = (),
 ) -> Generator[tuple[Task, Result | WorkerDied]]:
-    """Do tasks on a cluster; arguments, results and errors are as for :func:`facediff.utils.jobs.run_tasks`.
-
-    Args:
-        work: does a task.
-        tasks: its arguments.
-        scheduler: address of a Dask scheduler, or ``slurm`` with options.
-        workers: workers that are used at a time; all if None. With SLURM, how many are asked for.
-        writes: folder that tasks write to.
-        reads: files and folders that they read.
-    """
+    """Do tasks on a cluster; arguments, results and errors are as for :func:`facediff.utils.jobs.run_tasks`."""
     if not tasks:
         return
     import cloudpickle
 
     with ExitStack() as stack:
         stack.enter_context(quiet())
-        client = stack.enter_context(connected(scheduler, workers, len(tasks)))
+        client = stack.enter_context(connected(scheduler))
         files: dict[str, object] = {str(path.absolute()): fingerprint(str(path)) for path in reads}
         if writes is not None:
             files |= stack.enter_context(token(writes))
@@ -147,7 +131,7 @@ def results_of(
     try:
         while pending or running:
             addresses = list(client.nthreads())
-            last_worker = time.monotonic() if addresses or is_slurm(scheduler) else last_worker
+            last_worker = time.monotonic() if addresses else last_worker
             if time.monotonic() - last_worker > PATIENCE:
                 raise FaceDiffError(
                     f"--scheduler {scheduler}: has had no worker for {PATIENCE:.0f} s; start some with "
@@ -201,7 +185,7 @@ def refuse_unfit(client: Any, run: ClusterRun, scheduler: str) -> None:  # noqa:
     """Refuse workers that cannot take part in a run."""
     for address, answer in client.run(problem, run, on_error="return").items():
         if isinstance(answer, BaseException):
-            answer = f"has no facediff {__version__} ({reason(answer)}); {SAME}"  # noqa: PLW2901
+            answer = f"has no facediff {__version__} ({brief(answer.__cause__ or answer)}); {SAME}"  # noqa: PLW2901
         if answer:
             raise FaceDiffError(f"worker {address} of --scheduler {scheduler} {answer}")
 
@@ -246,98 +230,20 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def connected(scheduler: str, workers: int | None, tasks: int) -> Iterator[Any]:
+def connected(scheduler: str) -> Iterator[Any]:
     """A client of the scheduler."""
     import distributed
 
-    where: Any = slurm_cluster(scheduler, workers, tasks) if is_slurm(scheduler) else scheduler
     source = f"--scheduler {scheduler}: no Dask scheduler answers there within {CONNECTING:.0f} s"
     remedy = "start one with `dask scheduler`, or give the address that it prints"
     with damaged(source, remedy, OSError, RuntimeError, ImportError), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of other versions of packages
-        client = distributed.Client(where, timeout=CONNECTING, set_as_default=False, name="facediff")
+        client = distributed.Client(scheduler, timeout=CONNECTING, set_as_default=False, name="facediff")
     try:
         yield client
     finally:
         with suppress(Exception):  # a lost scheduler cannot be told
             client.close(timeout=2)
-
-
-def reason(error: BaseException) -> str:
-    """What an error of Dask's says, in a few words."""
-    text = re.sub(r"in <.*?>: ", "", " ".join(str(error.__cause__ or error).split())) or type(error).__name__
-    return text if len(text) <= 120 else f"{text[:120]}…"
-
-
-# SLURM.
-
-_clusters: dict[str, Any] = {}
-
-
-def is_slurm(scheduler: str) -> bool:
-    """Whether SLURM starts the workers."""
-    return scheduler.partition(":")[0] == SLURM
-
-
-def slurm_cluster(scheduler: str, workers: int | None, tasks: int) -> Any:  # noqa: ANN401
-    """Jobs of SLURM that are workers, by dask-jobqueue; started once in a process, and cancelled when it ends.
-
-    Args:
-        scheduler: ``slurm``, or ``slurm:OPTION=VALUE,…`` with options of ``dask_jobqueue.SLURMCluster``; others
-            are read from Dask's own configuration (``~/.config/dask/jobqueue.yaml``).
-        workers: how many; as many as in one job if None.
-        tasks: no more are started than there are tasks.
-    """
-    options = slurm_options(scheduler)
-    if scheduler not in _clusters:
-        if shutil.which("sbatch") is None:
-            raise FaceDiffError(f"--scheduler {scheduler}: there is no program sbatch; run facediff where SLURM is")
-        import dask_jobqueue
-
-        with (
-            damaged(f"--scheduler {scheduler}", "see docs/cluster.md", OSError, RuntimeError),
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("ignore")  # of a dashboard at another port
-            cluster = dask_jobqueue.SLURMCluster(**options)
-        refuse_job(scheduler, cluster.job_script())
-        _clusters[scheduler] = cluster
-        print("facediff: waiting for SLURM to start workers", file=sys.stderr, flush=True)
-    per_job = int(options["processes"] or 1)
-    _clusters[scheduler].scale(n=max(per_job, min(workers or per_job, tasks)))
-    return _clusters[scheduler]
-
-
-def refuse_job(scheduler: str, script: str) -> None:
-    """Let SLURM check a job before any is submitted: dask-jobqueue would go on waiting for one that is refused."""
-    with tempfile.NamedTemporaryFile("w", suffix=".sh") as file:
-        file.write(script)
-        file.flush()
-        command = ["sbatch", "--test-only", file.name]
-        completed = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
-    if completed.returncode:
-        raise FaceDiffError(f"--scheduler {scheduler}: SLURM refuses the job ({' '.join(completed.stderr.split())})")
-
-
-def slurm_options(scheduler: str) -> dict[str, Any]:
-    """The options of ``slurm:cores=4,memory=16GB``; a value is read as YAML, so that ``[a, b]`` is a list.
-
-    A worker does one task at a time on one processor, so a job has as many worker processes as cores unless
-    ``processes`` says otherwise.
-    """
-    import dask
-    import dask_jobqueue  # noqa: F401 - sets Dask's configuration of SLURM
-    import yaml
-
-    options: dict[str, Any] = {}
-    for word in filter(None, re.split(r",(?![^\[]*\])", scheduler.partition(":")[2])):
-        name, _, value = word.partition("=")
-        # A walltime such as 01:30:00 is a number to YAML.
-        number = re.fullmatch(r"[\d:-]+:[\d:]+", value)
-        options[name.strip().replace("-", "_")] = value if number else yaml.safe_load(value)
-    configured = dask.config.get("jobqueue.slurm", {})
-    options.setdefault("processes", configured.get("processes") or options.get("cores", configured.get("cores")))
-    return options
 
 
 # The workers. Everything below runs in the processes of the cluster.

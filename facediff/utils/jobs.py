@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.progress import progress_bar
-from facediff.utils.workers import LOCAL, SLURM, Mode, WorkerDied, processors, run_locally
+from facediff.utils.workers import LOCAL, Mode, WorkerDied, processors, run_locally
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -28,34 +28,25 @@ MOST_WORKERS = 4
 
 
 def check_scheduler(scheduler: str | None) -> str:
-    """Where tasks run: one of :data:`LOCAL`, the address of a Dask scheduler, ``slurm`` with options, or "" for here.
+    """Where tasks run: one of :data:`LOCAL`, the address of a Dask scheduler, or "" for here.
 
-    Args:
-        scheduler: as ``--scheduler`` takes it; if None, the value of the environment variable :data:`ADDRESS`.
-
-    Example:
-        >>> check_scheduler("threads")
-        'threads'
+    ``scheduler`` is as ``--scheduler`` takes it; None stands for the environment variable :data:`ADDRESS`.
     """
     name = "--scheduler"
     if scheduler is None:
         name, scheduler = ADDRESS, os.environ.get(ADDRESS, "")
         if not scheduler:
             return ""
-    kind, _, host = scheduler.partition("://")
-    if kind.partition(":")[0] == SLURM:
-        package = "dask_jobqueue"
-    elif kind in ("tcp", "tls", "ws", "wss", "inproc") and host:
-        package = "distributed"
-    elif scheduler in LOCAL and name != ADDRESS:
+    if scheduler in LOCAL and name != ADDRESS:
         return scheduler
-    else:
+    kind, _, host = scheduler.partition("://")
+    if kind not in ("tcp", "tls", "ws", "wss", "inproc") or not host:
         raise FaceDiffError(
-            f"{name} {scheduler}: is no place for tasks; expected {', '.join(LOCAL)}, slurm, or the address of a Dask "
+            f"{name} {scheduler}: is no place for tasks; expected {', '.join(LOCAL)}, or the address of a Dask "
             f"scheduler such as tcp://HOST:8786"
         )
-    if importlib.util.find_spec(package) is None:
-        raise MissingExtraError(package, "cluster", f"{name} {scheduler}")
+    if importlib.util.find_spec("distributed") is None:
+        raise MissingExtraError("distributed", "cluster", f"{name} {scheduler}")
     return scheduler
 
 

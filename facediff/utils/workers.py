@@ -26,8 +26,6 @@ Mode = Literal["processes", "threads", "serial"]
 """``processes`` for work in Python, ``threads`` for work that releases the interpreter's lock (torch, hashing)."""
 
 LOCAL = ("processes", "threads", "serial")
-SLURM = "slurm"
-"""How the name of a scheduler begins that asks SLURM for workers."""
 GRACE = 10.0
 """Seconds that running tasks are given to come to their end when the work is stopped."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

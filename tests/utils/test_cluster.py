@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -144,53 +143,3 @@ def test_a_cluster_without_workers_is_given_up(monkeypatch: pytest.MonkeyPatch) 
         pytest.raises(FaceDiffError, match="worker"),
     ):
         list(run_tasks(place, [0], scheduler=empty.scheduler_address))
-
-
-# SLURM, with programs in place of sbatch and scancel.
-
-
-@pytest.fixture
-def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """``sbatch`` keeps the script of each job and starts it; ``scancel`` notes the job's number."""
-    programs = tmp_path / "bin"
-    programs.mkdir()
-    sbatch = '#!/bin/sh\n[ "$1" = --test-only ] && exit 0\n'
-    sbatch += f'cp "$1" {tmp_path}/job.sh\necho x >> {tmp_path}/jobs\n[ -e {tmp_path}/run ] && '
-    sbatch += f'sh {tmp_path}/job.sh > {tmp_path}/log 2>&1 &\necho "Submitted batch job 7"\n'
-    for name, text in (("sbatch", sbatch), ("scancel", f'#!/bin/sh\necho "$@" >> {tmp_path}/cancelled\n')):
-        (programs / name).write_text(text)
-        (programs / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
-    monkeypatch.setattr(cluster, "_clusters", {})
-    yield tmp_path
-    for jobs_of_slurm in cluster._clusters.values():
-        jobs_of_slurm.close(timeout=5)
-
-
-def test_slurm_options_make_the_job_script(slurm: Path) -> None:
-    options = "queue=gpu,cores=4,memory=8GB,walltime=01:30:00,job_extra_directives=[--gres=gpu:1, --exclusive]"
-    made = cluster.slurm_cluster(f"slurm:{options}", 6, 100)
-    script = made.job_script()
-    for line in ("-p gpu", "--cpus-per-task=4", "--mem=8G", "-t 01:30:00", "--gres=gpu:1", "--exclusive"):
-        assert f"#SBATCH {line}" in script
-    assert "--nworkers 4" in script
-    assert "--nthreads 1" in script
-    jobs = slurm / "jobs"
-    wait_until(lambda: jobs.exists() and len(jobs.read_text().split()) == 2)  # six workers of four a job
-    assert re.sub(r"SLURMCluster-\d", "dummy-name", (slurm / "job.sh").read_text()) == script
-
-
-def test_a_job_that_slurm_refuses_is_an_error(slurm: Path) -> None:
-    (slurm / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: no such partition' >&2\nexit 1\n")
-    with pytest.raises(FaceDiffError, match=r"slurm:cores=1.*no such partition"):
-        list(run_tasks(place, [0], scheduler="slurm:cores=1,memory=1GB"))
-
-
-@pytest.mark.slow
-def test_tasks_run_in_jobs_of_slurm(slurm: Path) -> None:
-    (slurm / "run").touch()
-    where = "slurm:cores=1,memory=1GB,interface=lo"
-    results = dict(run_tasks(place, range(4), workers=2, scheduler=where))
-    assert sorted(results) == list(range(4))
-    cluster._clusters[where].close(timeout=5)
-    assert "7" in (slurm / "cancelled").read_text()
