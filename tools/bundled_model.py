@@ -1,6 +1,6 @@
 r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
-The recipe, where flite is installed and no voice of Festival but kal, in an hour and a quarter on two cores. READERS
+The recipe, where flite is installed, in an hour and a quarter on two cores. READERS
 are 121 people of LibriSpeech with up to two recordings each.
 
     $ facediff data align LibriSpeech -o READERS

@@ -114,8 +114,8 @@ class Puppet(SpeechMotionDataModule):
         seed: seed of the corpus; another seed makes another corpus.
         drawn_speakers: how many speakers with random voice, face and speaking style also say training sentences.
             The test splits do not change.
-        people_voices: let every second drawn speaker speak with a voice made from recordings of people, as far as flite
-            and Festival are installed.
+        people_voices: let every second drawn speaker speak with a voice made from recordings of people, if flite is
+            installed.
         recordings: folder of people's recordings as `facediff data align` writes them, ``SPEAKER/NAME.wav`` or
             ``.flac`` with ``NAME.TextGrid``: each person is a speaker more, with a drawn face and speaking style.
         motion: ``vertices``, or ``arkit`` for the truth as it is kept: ARKit's 52 shapes and two of

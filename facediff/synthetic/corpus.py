@@ -42,7 +42,7 @@ from facediff.synthetic.performance import MOODS, FaceMotion, synthesise_motion
 from facediff.synthetic.prosody import analyse
 from facediff.synthetic.recordings import recordings_of
 from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, WORDS, turn
-from facediff.synthetic.voices import Delivery, Flite, coloured_speech, installed_voices, open_voice
+from facediff.synthetic.voices import Delivery, Flite, coloured_speech, open_voice
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.batch import do_all
 from facediff.utils.checksums import describe_files, same_sizes
@@ -204,10 +204,8 @@ def _voices_of_test_c() -> tuple[str, ...]:
 
 def people_voices() -> tuple[str, ...]:
     """Voices made from recordings of people that are installed and may be trained on."""
-    voices = installed_voices()
-    names = [f"{program}:{voice}" for program in ("flite", "festival") for voice in voices.get(program, [])]
-    # kal is there twice, and as diphones in Festival; one of them is enough.
-    return tuple(name for name in names if name not in KEPT_OUT_PEOPLE and not name.endswith(("kal", "kal_diphone")))
+    names = [f"flite:{voice}" for voice in Flite.voices()]
+    return tuple(name for name in names if name not in KEPT_OUT_PEOPLE and not name.endswith("kal"))  # as kal16
 
 
 def generate(

@@ -75,9 +75,7 @@ class Language:
 
 
 LANGUAGES = {
-    "en": Language(
-        "English", ("espeak:en-us+f5", "flite:slt", "espeak:en-gb-scotland+m6", "festival:kal_diphone"), TEST
-    ),
+    "en": Language("English", ("espeak:en-us+f5", "flite:slt", "espeak:en-gb-scotland+m6"), TEST),
     "de": Language("German", ("espeak:de+m8", "espeak:de+f2"), GERMAN),
     "es": Language("Spanish", ("espeak:es+f2", "espeak:es-419+m3"), _SPANISH),
     "fr": Language("French", ("espeak:fr+m4", "espeak:fr+f4"), _FRENCH),

@@ -1,19 +1,16 @@
 """Synthesisers that speak for the built-in corpus, by name, such as ``espeak:en-us+f2`` or ``flite:slt``.
 
-espeak-ng comes with ``pip install "facediff[puppet]"`` and speaks a hundred languages by rule. flite and Festival are
-programs of their own (packages of the same names in Debian, Ubuntu, Fedora and Homebrew); their voices are made from
-recordings of people, so that models trained on them know more of people's voices. All of them print when each phoneme
-is spoken, which no recogniser has to guess. Where one is missing, its voices say how to install it.
+espeak-ng comes with ``pip install "facediff[puppet]"`` and speaks a hundred languages by rule. flite is a program of
+its own (a package in Debian, Ubuntu, Fedora and Homebrew); its voices are made from recordings of people, so that
+models trained on them know more of people's voices. Both print when each phoneme is spoken.
 """
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -28,7 +25,7 @@ from facediff.speech.audio import read_speech
 from facediff.speech.espeak import EspeakVoice, SpokenPhoneme, Utterance, speak
 from facediff.utils import SAMPLE_RATE
 
-_SECONDS = 120.0  # After which a synthesiser is taken to hang
+_SECONDS = 120.0  # After which flite is taken to hang
 _SEMITONE = 2.0 ** (1.0 / 12.0)
 
 
@@ -116,28 +113,13 @@ class Espeak(Synthesiser):
         return speak(text, EspeakVoice(self.voice, round(155 * delivery.rate), pitch, spread))
 
 
-# The phones of CMU's dictionary, as flite and Festival name them, in the International Phonetic Alphabet.
+# The phones of CMU's dictionary, as flite names them, in the International Phonetic Alphabet.
 _CMU = """
 aa=ɑ ae=æ ah=ʌ ao=ɔ aw=aʊ ax=ə axr=ɚ ay=aɪ eh=ɛ er=ɝ ey=eɪ ih=ɪ iy=i ow=oʊ oy=ɔɪ uh=ʊ uw=u el=əl em=əm en=ən
 b=b ch=tʃ d=d dh=ð dx=ɾ f=f g=ɡ hh=h hv=ɦ jh=dʒ k=k l=l m=m n=n nx=ɾ ng=ŋ p=p q=ʔ r=ɹ s=s sh=ʃ t=t th=θ v=v
 w=w y=j z=z zh=ʒ pau= h#= brth=
 """
 CMU_PHONES = dict(pair.split("=") for pair in _CMU.split())
-
-# Phones of Festival's sets that are no symbols of that alphabet; figures at the end mark stress.
-_PHONES = {
-    "radio": CMU_PHONES,
-    "italian": {
-        **{"E": "ɛ", "O": "ɔ", "S": "ʃ", "Z": "ʒ", "tS": "tʃ", "dZ": "dʒ", "J": "ɲ", "L": "ʎ", "ng": "ŋ", "nf": "ɱ"},
-    },
-    "upc_catalan-central": {"ax": "ə", "E": "ɛ", "O": "ɔ", "S": "ʃ", "Z": "ʒ", "J": "ɲ", "L": "ʎ", "rr": "r", "r": "ɾ"},
-    "finnish": {"@": "æ", "7": "ø", "&": "ə", "T": "θ", "D": "ð", "S": "ʃ", "Z": "ʒ", "N": "ŋ", "L": "ʎ"},
-    "czech": {
-        **{"c": "ts", "c~": "tʃ", "ch": "x", "d~": "ɟ", "dz~": "dʒ", "h": "ɦ", "n*": "ŋ", "n~": "ɲ", "r~": "r"},
-        **{"r~*": "r", "s~": "ʃ", "t~": "c", "z~": "ʒ", "_": "ʔ"},
-    },
-}
-_PAUSES = {"pau", "#", "##"}
 
 
 @puppet_voice.register("flite")
@@ -149,8 +131,8 @@ class Flite(Synthesiser):
     @classmethod
     def voices(cls) -> list[str]:
         """Flite's voices, without those that can tell the time only."""
-        names = _listed("flite", "-lv").partition(":")[2].split()
-        return [name for name in names if not name.endswith("_time")]
+        program = shutil.which("flite")
+        return [] if program is None else _flite_voices(program)
 
     def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
         """Speak a sentence."""
@@ -162,50 +144,16 @@ class Flite(Synthesiser):
         with tempfile.TemporaryDirectory() as folder:
             sound = Path(folder) / "speech.wav"
             options = [word for name, value in settings.items() for word in ("--setf", f"{name}={value:g}")]
-            printed = _run(["flite", "-voice", self.voice, *options, "-psdur", "-t", text, "-o", str(sound)])
-            ends = [phone.rpartition(":")[::2] for phone in printed.split() if ":" in phone]
+            printed = _run("flite", "-voice", self.voice, *options, "-psdur", "-t", text, "-o", str(sound))
+            phonemes, start = [], 0.0
             with damaged(f'voice "{self.voice}"', "install flite again"):
-                return _utterance(sound, ((name, float(end)) for name, end in ends), f"flite:{self.voice}")
-
-
-@puppet_voice.register("festival")
-class Festival(Synthesiser):
-    """Festival: voices of people in several languages, one package each (festvox-…).
-
-    A voice reads English by the rules of its own language, and Festival prints its phones.
-    """
-
-    install = "install the packages festival and festvox-kallpc16k (apt install festival festvox-kallpc16k)"
-
-    @classmethod
-    def voices(cls) -> list[str]:
-        """Festival's voices with known phones."""
-        return sorted(cls._phone_sets())
-
-    @staticmethod
-    def _phone_sets() -> dict[str, str]:
-        """The phone set of each voice."""
-        query = "(mapcar (lambda (v) (voice.select v) (print (cons v (PhoneSet.description '(name))))) (voice.list))"
-        pairs = re.findall(r"\((\S+) \(name (\S+?)\)\)", _listed("festival", "-b", query))
-        return {voice: phones for voice, phones in pairs if phones in _PHONES}
-
-    def speak(self, text: str, delivery: Delivery = Delivery()) -> Utterance:  # noqa: B008 - frozen
-        """Speak a sentence."""
-        with tempfile.TemporaryDirectory() as folder:
-            sound, labels = Path(folder) / "speech.wav", Path(folder) / "speech.lab"
-            quoted = text.replace("\\", " ").replace('"', " ")
-            program = (
-                f"(begin (voice_{self.voice}) (Parameter.set 'Duration_Stretch {1.0 / delivery.rate:g})"
-                f' (set! u (Utterance Text "{quoted}")) (utt.synth u) (utt.save.segs u "{labels}")'
-                f' (utt.save.wave u "{sound}" "riff"))'
-            )
-            _run(["festival", "-b", program])
-            with damaged(f'voice "{self.voice}"', "install Festival again", OSError):
-                rows = [line.split() for line in labels.read_text().splitlines() if len(line.split()) == 3]
-                phones = _PHONES[self._phone_sets()[self.voice]]
-                return _utterance(
-                    sound, ((name, float(end)) for end, _, name in rows), f"festival:{self.voice}", phones
-                )
+                for name, colon, time in (phone.rpartition(":") for phone in printed.split()):
+                    if colon and (end := float(time)) > start:
+                        phonemes.append(SpokenPhoneme(start, end, CMU_PHONES.get(name, name)))
+                        start = end
+            if not sound.is_file() or not any(phoneme.ipa for phoneme in phonemes):
+                raise FaceDiffError(f'voice "flite:{self.voice}": spoke nothing; give it a text with words')
+            return Utterance(read_speech(sound), tuple(phonemes))
 
 
 @lru_cache
@@ -213,38 +161,17 @@ def _languages(folder: str) -> list[str]:
     return sorted(path.name.lower() for path in (Path(folder) / "lang").rglob("*") if path.is_file())
 
 
-def _listed(name: str, *arguments: str) -> str:
-    """The voices that a program prints; nothing where it is missing."""
-    program = shutil.which(name)
-    return "" if program is None else _printed_once(program, *arguments)
-
-
 @lru_cache
-def _printed_once(*command: str) -> str:
-    return _run(command)
+def _flite_voices(program: str) -> list[str]:
+    names = _run(program, "-lv").partition(":")[2].split()
+    return [name for name in names if not name.endswith("_time")]
 
 
-def _run(command: Sequence[str]) -> str:
-    """The output of a synthesiser."""
+def _run(*command: str) -> str:
     with damaged(f"{command[0]}: failed", "try it in a terminal", OSError, subprocess.SubprocessError):
         return subprocess.run(  # noqa: S603 - a program on the path, without a shell
             command, capture_output=True, text=True, check=True, timeout=_SECONDS
         ).stdout
-
-
-def _utterance(
-    sound: Path, ends: Iterable[tuple[str, float]], voice: str, phones: Mapping[str, str] = CMU_PHONES
-) -> Utterance:
-    """A sound file at 16 kHz with its phones, which are given by name and end in seconds."""
-    phonemes, start = [], 0.0
-    for name, end in ends:
-        if end > start:
-            plain = name.rstrip(":") if name.rstrip(":") in phones else name.rstrip("01:")
-            phonemes.append(SpokenPhoneme(start, end, "" if name in _PAUSES else phones.get(plain, plain)))
-        start = max(start, end)
-    if not sound.is_file() or not any(phoneme.ipa for phoneme in phonemes):
-        raise FaceDiffError(f'voice "{voice}": spoke nothing; give it a text with words')
-    return Utterance(read_speech(sound), tuple(phonemes))
 
 
 def coloured_speech(samples: NDArray[np.float32], loudness: float, brightness: float) -> NDArray[np.float32]:

@@ -75,7 +75,6 @@ def _together(
                     running[pool.submit(work, queue[0])] = queue[0]
                 queue.popleft()
             complete, _ = wait(running, return_when=FIRST_COMPLETED)
-            _raise_first_error(running, complete)
             for future in complete:
                 if not isinstance(future.exception(), BrokenProcessPool):
                     yield running.pop(future), future.result()
@@ -88,16 +87,6 @@ def _together(
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _raise_first_error(running: Collection[Future[Any]], complete: Collection[Future[Any]]) -> None:
-    """Raise the error of the first task that failed, in the order of the tasks, and not of the quickest to fail."""
-    for index, future in enumerate(running):
-        if future in complete and isinstance(future.exception(), Exception):
-            wait(list(running)[: index + 1])
-            for earlier in list(running)[: index + 1]:
-                if not isinstance(earlier.exception(), BrokenProcessPool):
-                    earlier.result()
 
 
 def end_soon(pool: Executor, running: Collection[Future[Any]]) -> None:

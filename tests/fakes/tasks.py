@@ -68,9 +68,3 @@ def write_slowly(folder: Path, task: int) -> int:
             (folder / f"begun{task}").touch()
             time.sleep(60)
     return task
-
-
-def fail_after(seconds: float) -> None:
-    """Raise an error that names the time, after it."""
-    time.sleep(seconds)
-    raise FaceDiffError(str(seconds))

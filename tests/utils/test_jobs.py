@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from facediff.errors import FaceDiffError, MissingExtraError
+from facediff.errors import MissingExtraError
 from facediff.utils.jobs import PerWorker, SetupError, run_tasks
 from facediff.utils.workers import Mode, WorkerDied
-from tests.fakes.tasks import deadly, fail_after, failing_setup, raising, square
+from tests.fakes.tasks import deadly, failing_setup, raising, square
 
 ROOT = Path(__file__).parents[2]
 MODES: list[Mode] = ["processes", "threads", "serial"]
@@ -105,10 +105,3 @@ def test_where_processes_cannot_start_this_one_does_the_work() -> None:
     )
     run = subprocess.run([sys.executable, "-"], input=program, capture_output=True, text=True, timeout=60, cwd=ROOT)
     assert run.returncode == 0, run.stderr
-
-
-@pytest.mark.parametrize("mode", ["processes", "threads"])
-def test_of_several_errors_the_first_tasks_is_raised(mode: Mode) -> None:
-    """Whichever fails first: a command says the same every time."""
-    with pytest.raises(FaceDiffError, match="^0.3$"):
-        list(run_tasks(fail_after, [0.3, 0.0, 0.1], workers=3, mode=mode))
