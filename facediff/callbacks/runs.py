@@ -8,7 +8,7 @@ import re
 import secrets
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from facediff.data import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
-from facediff.utils.files import LockedError, atomic, locked, remove_lock, sweep
+from facediff.utils.files import LockedError, atomic, locked, remove_partial
 from facediff.utils.hub import check_model_source, check_training_source, local_model
 
 STATE_KEY = "facediff_training_state"
@@ -210,10 +210,10 @@ def entered_run(
                     if numbered and entries:
                         continue  # new loggers look for a free number again
                     raise
-                for earlier in run_folder(trainer).parent.glob("*/"):  # leftovers of runs that were killed
-                    sweep(earlier)
-                    sweep(earlier / "checkpoints")
-                    remove_lock(earlier / LOCK)
+                remove_partial(run_folder(trainer), recursive=True)
+                for other in run_folder(trainer).parent.glob("*/"):  # leftovers of runs that were killed
+                    with suppress(FaceDiffError, OSError), locked(other / LOCK, ""):
+                        remove_partial(other, recursive=True)
             yield
             return
 

@@ -6,10 +6,8 @@ import errno
 import glob
 import os
 import platform
-import re
 import secrets
 import shutil
-import socket
 import sys
 import time
 import zlib
@@ -23,7 +21,7 @@ from weakref import WeakSet
 from facediff.errors import FaceDiffError, printable
 from facediff.utils.output_paths import destination, refuse_protected
 
-ABANDONED_AFTER = 86_400.0  # seconds; a half-written folder is removed then even where the file system has no locks
+ABANDONED_AFTER = 86_400.0  # seconds after which what nobody writes to any more is removed
 
 
 def cache_dir() -> Path:
@@ -83,7 +81,6 @@ def atomic(path: Path) -> Iterator[Path]:
                 yield temporary
                 _hand_on(target, temporary)
                 os.replace(temporary, target)
-                _note_swept(target.parent)
             finally:
                 discard(temporary)  # never written, or renamed, or to be given up
 
@@ -178,13 +175,9 @@ def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
     except OSError as error:
         if error.errno != errno.EXDEV:
             raise
-        copy = _copied_next_to(path, source)  # a link leads to another disk
-        try:
+        with scratch_folder(path) as scratch:  # a link leads to another disk
+            copy = Path(shutil.move(source, scratch / path.name))
             _rename(copy, path, replace=replace)
-        finally:
-            _remove(copy)
-        _remove(source)
-    _note_swept(path.parent)
 
 
 def _rename(source: Path, target: Path, *, replace: bool) -> None:
@@ -223,31 +216,13 @@ def _exchange(first: Path, second: Path) -> bool:
     return rename is not None and rename(cwd, os.fsencode(first), cwd, os.fsencode(second), exchange) == 0
 
 
-def _copied_next_to(target: Path, source: Path) -> Path:
-    copy = _partial(target)
-    copy = copy.with_name(f"{copy.name}{UNLOCKED}")
-    try:
-        if source.is_dir():
-            shutil.copytree(source, copy)
-        else:
-            shutil.copy2(source, copy)
-    except BaseException:
-        _remove(copy)
-        raise
-    return copy
-
-
 def _hand_on(old: Path, new: Path) -> None:
-    """Give a new file the owner and the permissions of the one that it replaces."""
-    try:
-        before, after = old.stat(), new.stat()
-    except OSError:
-        return
-    if (before.st_uid, before.st_gid) != (after.st_uid, after.st_gid):
-        with suppress(OSError):
-            os.chown(new, before.st_uid, before.st_gid)
+    """Give a new file the permissions and the owner of the one that it replaces, as far as this user may."""
     with suppress(OSError):
+        before, after = old.stat(), new.stat()
         os.chmod(new, before.st_mode & 0o777)
+        if (before.st_uid, before.st_gid) != (after.st_uid, after.st_gid):
+            os.chown(new, before.st_uid, before.st_gid)
 
 
 def _refuse_unwritable(path: Path, target: Path) -> None:
@@ -304,23 +279,18 @@ def _try_to_write(path: Path) -> None:
         discard(probe)
 
 
-# What killed processes leave. A partial file is named  .NAME.partial-HOST-PROCESS-START-TOKEN.SUFFIX
+# What killed processes leave: .NAME.partial-TOKEN.SUFFIX.
 
-PARTIAL = re.compile(r"\..*\.partial-(?P<host>[0-9a-f]{8})-(?P<process>\d+)-(?P<start>\d+)-[0-9a-f]{8}", re.DOTALL)
 UNLOCKED = ".new"
 """How the names of folders end that are not locked although their process may be at work."""
 LONGEST = 60
 """Bytes of a name that the name of its partial file repeats; a valid name must not become too long by that."""
-_swept: dict[str, int] = {}
-"""Folders without leftovers, and their time of change when this process looked last."""
 
 
 def _partial(path: Path, suffix: str = "") -> Path:
-    # Containers that share a folder may have equal process numbers, hence the token.
     name = path.name.removesuffix(path.suffix) if suffix else path.name
-    owner = f"{_host()}-{os.getpid()}-{_start_of(os.getpid())}-{secrets.token_hex(4)}"
     suffix = suffix if len(os.fsencode(suffix)) <= 24 else ""  # no format has a longer one
-    return path.with_name(f".{short_name(name, LONGEST)}.partial-{owner}{suffix}")
+    return path.with_name(f".{short_name(name, LONGEST)}.partial-{secrets.token_hex(8)}{suffix}")
 
 
 def short_name(name: str, length: int) -> str:
@@ -339,67 +309,21 @@ def valid_text(name: str) -> str:
     return os.fsencode(name).decode(errors="replace")
 
 
-def sweep(folder: Path) -> None:
-    """Remove what killed processes have left of files and folders; others may still be writing theirs."""
-    try:
-        if _swept.get(str(folder)) == folder.stat().st_mtime_ns:  # else each of many files would cost a look at all
-            return
-        entries = [entry for entry in os.scandir(folder) if ".partial-" in entry.name]
-    except OSError:
-        return
-    for entry in entries:
-        left = Path(entry.path)
-        with suppress(OSError):
-            if entry.is_dir(follow_symlinks=False):
-                with _locked_folder(left) as lock:
-                    unlocked = lock is None or left.name.endswith(UNLOCKED)
-                    if lock is not False and (not unlocked or _is_abandoned(left)):
-                        shutil.rmtree(left, ignore_errors=True)
-            elif _is_abandoned(left):
-                left.unlink(missing_ok=True)
-
-
-def _note_swept(folder: Path) -> None:
-    with suppress(OSError):
-        _swept[str(folder)] = folder.stat().st_mtime_ns
-
-
-def _is_abandoned(left: Path) -> bool:
-    owner = PARTIAL.match(left.name)
-    if owner is None:
-        return False
-    if owner["host"] != _host():
-        return time.time() - left.stat().st_mtime > ABANDONED_AFTER
-    process = int(owner["process"])
-    return not _is_running(process) or owner["start"] != _start_of(process)
-
-
 @cache
-def _host() -> str:
-    """A short name of this machine, or of this container, for folders that several share."""
-    try:
-        space = os.readlink("/proc/self/ns/pid")  # process numbers mean something within it only
-    except OSError:
-        space = ""
-    return f"{zlib.crc32(f'{socket.gethostname()} {space}'.encode()):08x}"
-
-
-def _start_of(process: int) -> str:
-    """When a process started, in the system's own count, since numbers of processes are used again; 0 if unknown."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[19]
-    except (OSError, IndexError):
-        return "0"
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # somebody else's process
-        return True
-    return True
+def sweep(folder: Path) -> None:
+    """Remove what killed processes have left, once in a process: folders at once, by their locks, and old files."""
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            if ".partial-" not in entry.name:
+                continue
+            old = time.time() - entry.stat(follow_symlinks=False).st_mtime > ABANDONED_AFTER
+            if not entry.is_dir(follow_symlinks=False):
+                if old:
+                    os.unlink(entry)
+                continue
+            with _locked_folder(Path(entry.path)) as lock:
+                if (lock and not entry.name.endswith(UNLOCKED)) or (lock is not False and old):
+                    shutil.rmtree(entry, ignore_errors=True)
 
 
 def reserve_room(path: Path) -> None:
@@ -463,13 +387,6 @@ def locked(path: Path, command: str) -> Iterator[None]:
         yield
 
 
-def remove_lock(path: Path) -> None:
-    """Remove the lock file of a process that was killed; one that is held stays."""
-    if path.is_file():
-        with suppress(FaceDiffError, OSError), locked(path, ""):
-            pass
-
-
 class LockedError(FaceDiffError):
     """Another process is at work in a folder."""
 
@@ -506,10 +423,7 @@ def _lock_file(path: Path, command: str) -> IO[bytes]:
             if stream.read(7) in (b"", b"process"):
                 stream.seek(0)
                 stream.truncate()
-                job = os.environ.get("SLURM_JOB_ID")
-                stream.write(
-                    f"process {os.getpid()} on {platform.node()}{f', SLURM job {job}' if job else ''}".encode()
-                )
+                stream.write(f"process {os.getpid()} on {platform.node()}".encode())
             return stream
         stream.close()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from facediff.utils.files import (
     put_in_place,
     reserve_room,
     scratch_folder,
+    sweep,
 )
 from facediff.utils.plain_files import read_json, write_json, write_rows
 
@@ -188,7 +188,7 @@ def test_every_valid_name_can_be_written(tmp_path: Path, name: str) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {name, "folder", "a.json"}
 
 
-def test_what_a_killed_process_left_is_removed_and_what_a_living_one_writes_stays(tmp_path: Path) -> None:
+def test_old_leftovers_are_removed_and_others_stay(tmp_path: Path) -> None:
     program = (
         "import os, sys, pathlib; from facediff.utils.files import atomic\n"
         "with atomic(pathlib.Path(sys.argv[1])) as temporary: temporary.touch(); os._exit(9)"
@@ -196,13 +196,12 @@ def test_what_a_killed_process_left_is_removed_and_what_a_living_one_writes_stay
     subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.npy")], cwd=ROOT, check=False)
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".a.partial-")
-    again = left.with_name(re.sub(r"-\d+-\d+-", f"-{os.getpid()}-1-", left.name))
-    again.touch()  # of another process that had the number of this one
-    with atomic(tmp_path / "b.npy") as living:
-        living.touch()
-        write(tmp_path / "c.npy")
-        assert {path.name for path in tmp_path.iterdir()} == {"c.npy", living.name}
-    assert {path.name for path in tmp_path.iterdir()} == {"b.npy", "c.npy"}
+    sweep(tmp_path)
+    assert left.exists()
+    sweep.cache_clear()
+    os.utime(left, (0, 0))
+    write(tmp_path / "b.npy")
+    assert {path.name for path in tmp_path.iterdir()} == {"b.npy"}
 
 
 @pytest.mark.parametrize("hard", [False, True])
