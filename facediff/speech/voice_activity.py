@@ -7,11 +7,13 @@ in streams alike; and faults of recordings (:func:`speech_problems`).
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import math
 from abc import ABC, abstractmethod
 from collections import deque
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, cast
 
 import numpy as np
@@ -321,6 +323,105 @@ class _WebRtcListener(Listener):
     def finish(self) -> list[bool]:
         """Nothing waits."""
         return []
+
+
+@voice_gate.register("silero")
+class SileroGate(EnergyGate):
+    """Speech rises above the noise, as for ``energy``, and Silero's network hears a voice: music is none.
+
+    The network (Silero team, MIT, 2.3 MB) comes with ``pip install --no-deps silero-vad`` (5 or 6).
+
+    Args:
+        threshold: probability above which there is a voice.
+        model: path of silero_vad.onnx; that of the installed package if empty.
+        energy: options of :class:`EnergyGate`.
+    """
+
+    def __init__(
+        self,
+        *,
+        threshold: Annotated[float, Range(0, 1)] = 0.5,
+        model: str = "",
+        **energy: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(**energy)
+        self.threshold = threshold
+        self.look_ahead = max(self.look_ahead, math.ceil(SILERO_CHUNK / HOP))
+        self.model = Path(model).expanduser() if model else installed_silero()
+        if not self.model.is_file():
+            raise FaceDiffError(
+                f"voice gate silero: {self.model} is not there; `pip install --no-deps silero-vad`, or give "
+                f"silero:model=FILE"
+            )
+
+    def listener(self) -> Listener:
+        """A detector at the beginning of a recording."""
+        return _SileroListener(self)
+
+
+def installed_silero() -> Path:
+    """Where the package silero-vad has its network; it is not imported, since that takes PyTorch and torchaudio."""
+    spec = importlib.util.find_spec("silero_vad")
+    folders = [] if spec is None else list(spec.submodule_search_locations or [])
+    return Path(folders[0] if folders else ".") / "data" / "silero_vad.onnx"
+
+
+SILERO_CHUNK, SILERO_CONTEXT = 512, 64
+"""Samples that the network hears at a time, and those before them that it hears again."""
+
+
+class _SileroListener(Listener):
+    """A step is speech if it is for the level, and for the network in the chunk of the step's middle."""
+
+    def __init__(self, gate: SileroGate) -> None:
+        import onnxruntime  # type: ignore[import-untyped]
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self.gate = gate
+        self._level = _EnergyListener(gate)
+        self._network = onnxruntime.InferenceSession(gate.model, options, providers=["CPUExecutionProvider"])
+        self._state = np.zeros((2, 1, 128), np.float32)
+        self._context = np.zeros(SILERO_CONTEXT, np.float32)
+        self._unheard = np.zeros(0, np.float32)  # samples that fill no chunk yet
+        self._loud: deque[bool] = deque()  # steps that the network has not decided on
+        self._voiced: list[bool] = []  # chunks, the first of which is the one of the first step that waits
+        self._steps = self._chunks = 0  # steps that were decided on, and chunks that were dropped
+
+    def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
+        """Decide on the steps of which level and network are known."""
+        self._loud += self._level.hear(steps)
+        self._unheard = np.concatenate([self._unheard, steps.reshape(-1).astype(np.float32)])
+        while len(self._unheard) >= SILERO_CHUNK:
+            chunk, self._unheard = self._unheard[:SILERO_CHUNK], self._unheard[SILERO_CHUNK:]
+            self._voiced.append(self._probability(chunk) >= self.gate.threshold)
+        return self._decided()
+
+    def finish(self) -> list[bool]:
+        """Decide on all that is left, as if silence followed."""
+        self._loud += self._level.finish()
+        if len(self._unheard):
+            rest = np.pad(self._unheard, (0, SILERO_CHUNK - len(self._unheard)))
+            self._voiced.append(self._probability(rest) >= self.gate.threshold)
+        return self._decided()
+
+    def _probability(self, chunk: npt.NDArray[np.float32]) -> float:
+        heard = np.concatenate([self._context, chunk])
+        self._context = heard[-SILERO_CONTEXT:]
+        feeds = {"input": heard[None], "state": self._state, "sr": np.array(SAMPLE_RATE, np.int64)}
+        probability, self._state = self._network.run(None, feeds)
+        return float(np.asarray(probability).item())
+
+    def _decided(self) -> list[bool]:
+        decisions = []
+        while self._loud and (chunk := (self._steps * HOP + HOP // 2) // SILERO_CHUNK - self._chunks) < len(
+            self._voiced
+        ):
+            decisions.append(self._loud.popleft() and self._voiced[chunk])
+            self._steps += 1
+        drop = min((self._steps * HOP + HOP // 2) // SILERO_CHUNK - self._chunks, len(self._voiced))
+        self._voiced, self._chunks = self._voiced[drop:], self._chunks + drop
+        return decisions
 
 
 class Openness:

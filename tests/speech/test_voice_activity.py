@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import tempfile
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import soundfile
 from hypothesis import given, settings
@@ -114,14 +116,36 @@ def test_words_in_one_breath_are_no_noise() -> None:
     assert found[8:-8].min() > 0.9
 
 
+def silero_like(path: Path) -> Path:
+    """A graph with the inputs and outputs of Silero's: a voice is heard where samples are positive on average."""
+    make, kind = onnx.helper.make_tensor_value_info, onnx.TensorProto
+    nodes = [
+        onnx.helper.make_node("ReduceMean", ["input"], ["mean"], keepdims=1),
+        onnx.helper.make_node("Greater", ["mean", "zero"], ["above"]),
+        onnx.helper.make_node("Cast", ["above"], ["output"], to=kind.FLOAT),
+        onnx.helper.make_node("Identity", ["state"], ["stateN"]),
+    ]
+    graph = onnx.helper.make_graph(
+        nodes,
+        "vad",
+        [make("input", kind.FLOAT, [1, 576]), make("state", kind.FLOAT, [2, 1, 128]), make("sr", kind.INT64, [])],
+        [make("output", kind.FLOAT, None), make("stateN", kind.FLOAT, [2, 1, 128])],
+        [onnx.helper.make_tensor("zero", kind.FLOAT, [], [0.0])],
+    )
+    onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=9), path)
+    return path
+
+
 @functools.cache
 def gates() -> list[VoiceGate]:
-    """All gates."""
+    """All gates; Silero's with a network that takes every other sample for a voice."""
     pytest.importorskip("webrtcvad")
-    return [read_gate(name) for name in sorted(voice_gate.names())]  # type: ignore[misc]
+    model = silero_like(Path(tempfile.mkdtemp()) / "vad.onnx")
+    names = [name if name != "silero" else f"silero:model={model}" for name in voice_gate.names()]
+    return [read_gate(name) for name in sorted(names, key=lambda name: "silero" in name)]  # type: ignore[misc]
 
 
-@given(cuts=st.lists(st.integers(1, 30_000), max_size=8), which=st.integers(0, 1))
+@given(cuts=st.lists(st.integers(1, 30_000), max_size=8), which=st.integers(0, 2))
 @settings(max_examples=15, deadline=None)
 def test_openness_does_not_depend_on_how_speech_is_cut(cuts: list[int], which: int) -> None:
     gate = gates()[which]
@@ -174,3 +198,22 @@ def test_recordings_are_told_what_is_wrong_with_them() -> None:
     assert "clipped" in " ".join(speech_problems(np.clip(6 * clean, -1, 1)))
     assert "dB below the speech" in " ".join(speech_problems(sentence_with_pauses(15)))
     assert "no speech" in " ".join(speech_problems(0.1 * random.standard_normal(RATE)))
+
+
+def test_silero_is_the_lower_of_level_and_network(tmp_path: Path) -> None:
+    """Loud sound of which the network hears no voice is a pause, and so is a voice below the noise; in any pieces."""
+    model = silero_like(tmp_path / "vad.onnx")
+    random = np.random.default_rng(0)
+    speech = 1e-4 * random.standard_normal(8 * 16_000)
+    speech[2 * 16_000 : 4 * 16_000] += 0.3 * (1 + np.sin(np.arange(2 * 16_000)))
+    speech[5 * 16_000 : 7 * 16_000] -= 0.3 * (1 + np.sin(np.arange(2 * 16_000)))
+    gate = read_gate(f"silero:model={model}")
+    opened = openness(speech, 200, 25.0, gate)
+    assert opened[55:95].min() == 1
+    assert opened[:44].max() == opened[108:].max() == 0
+    tracker = Openness(gate, 25.0)
+    places = [0, *np.sort(random.integers(len(speech), size=60)).tolist(), len(speech)]
+    parts = [tracker.feed(speech[a:b]) for a, b in zip(places, places[1:], strict=False)]
+    np.testing.assert_array_equal(np.concatenate([*parts, tracker.finish(200)]), opened)
+    with pytest.raises(FaceDiffError, match="pip install --no-deps silero-vad"):
+        read_gate(f"silero:model={tmp_path / 'missing.onnx'}")
