@@ -32,9 +32,6 @@ from facediff.metrics.base import SequenceMetric as SequenceMetric
 from facediff.metrics.base import align as align
 from facediff.metrics.base import describe_column as describe_column
 from facediff.metrics.base import functional as functional
-from facediff.metrics.beats import HeadBeatAlignment as HeadBeatAlignment
-from facediff.metrics.beats import head_beat_alignment as head_beat_alignment
-from facediff.metrics.beats import onsets as onsets
 from facediff.metrics.by_name import NEEDS as NEEDS
 from facediff.metrics.by_name import Context as Context
 from facediff.metrics.by_name import Request as Request
@@ -44,7 +41,6 @@ from facediff.metrics.channels import ChannelDynamicsDeviation as ChannelDynamic
 from facediff.metrics.channels import ChannelVariance as ChannelVariance
 from facediff.metrics.channels import FramePairDistance as FramePairDistance
 from facediff.metrics.channels import FrechetDistance as FrechetDistance
-from facediff.metrics.channels import LipDynamicsDeviation as LipDynamicsDeviation
 from facediff.metrics.channels import ResidualPartnerCorrelation as ResidualPartnerCorrelation
 from facediff.metrics.channels import ShannonIndex as ShannonIndex
 from facediff.metrics.channels import StepDistance as StepDistance
@@ -52,7 +48,6 @@ from facediff.metrics.channels import channel_dynamics_deviation as channel_dyna
 from facediff.metrics.channels import channel_variance as channel_variance
 from facediff.metrics.channels import frame_pair_distance as frame_pair_distance
 from facediff.metrics.channels import frechet_distance as frechet_distance
-from facediff.metrics.channels import lip_dynamics_deviation as lip_dynamics_deviation
 from facediff.metrics.channels import residual_partner_correlation as residual_partner_correlation
 from facediff.metrics.channels import shannon_index as shannon_index
 from facediff.metrics.channels import split_frames as split_frames
@@ -107,10 +102,7 @@ from facediff.metrics.samples import identity_diversity as identity_diversity
 from facediff.metrics.samples import mean_estimate_error as mean_estimate_error
 from facediff.metrics.samples import sample_diversity as sample_diversity
 from facediff.metrics.speech import ClipSpeechLipCorrelation as ClipSpeechLipCorrelation
-from facediff.metrics.speech import FrameSpeechLipCorrelation as FrameSpeechLipCorrelation
-from facediff.metrics.speech import SpeechLipMetric as SpeechLipMetric
 from facediff.metrics.speech import clip_speech_lip_correlation as clip_speech_lip_correlation
-from facediff.metrics.speech import frame_speech_lip_correlation as frame_speech_lip_correlation
 from facediff.metrics.speech import speech_intensity as speech_intensity
 from facediff.metrics.speed import RealTimeFactor as RealTimeFactor
 from facediff.metrics.speed import device_name as device_name

@@ -108,7 +108,6 @@ class Clip:
         closures: closures of the mouth, each a first frame and the frame after the last.
         identity: number of the identity.
         partner: (frames, channels, dims), a view: the motion of the other person in a conversation.
-        beats: frames in which the speech has an onset, fractions among them (beats,), float64.
     """
 
     name: str
@@ -119,7 +118,6 @@ class Clip:
     closures: tuple[tuple[int, int], ...] = ()
     identity: int = 0
     partner: Tensor | None = None
-    beats: Tensor | None = None
 
     @property
     def frames(self) -> int:
@@ -613,13 +611,6 @@ class SequenceMetric(ExactMetric):
         return Coverage(*self.counts.tolist())
 
 
-def of_side(of: Side, clip: Clip, score: Callable[[Tensor], Tensor]) -> Tensor:
-    """A score of one side's motion (frames, vertices, 3) alone, or the prediction's minus the truth's."""
-    if of == "gap":
-        return score(clip.prediction) - score(clip.truth)
-    return score(clip.prediction if of == "prediction" else clip.truth)
-
-
 class LipMetric(SequenceMetric):
     """Base of metrics over the lip vertices that are pooled by sequence and have no options of their own.
 
@@ -633,6 +624,55 @@ class LipMetric(SequenceMetric):
 
     def __init__(self, lips: RegionLike, **options: Unpack[SequenceOptions]) -> None:
         super().__init__(region=as_region(lips, "lips"), **options)
+
+
+class SumsMetric(SequenceMetric):
+    """Base of metrics of sums over all sequences, which have no value of a single sequence.
+
+    Args:
+        shape: of the sums.
+        **options: of the next base class.
+    """
+
+    divides_by: ClassVar[str] = "the denominator is zero on every sequence"
+    sums: Tensor
+
+    def __init__(self, *, shape: tuple[int, ...], **options: Any) -> None:  # noqa: ANN401 - the next base's
+        super().__init__(**options)
+        self.add_state("sums", torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
+        self._added: list[Tensor] = []
+
+    @abstractmethod
+    def clip_sums(self, clip: Clip) -> Tensor:
+        """The sums of one sequence, float64."""
+
+    @abstractmethod
+    def score(self, sums: Tensor) -> Tensor:
+        """From the sums over all sequences to the score, a float64 scalar."""
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """Zero, which does not enter the score."""
+        self._added.append(self.clip_sums(clip))
+        return torch.zeros((), dtype=torch.float64, device=clip.truth.device)
+
+    def add(self, clips: Clips) -> None:
+        """Check aligned sequences and add their sums; nothing is added where one is refused."""
+        self._added = []
+        super().add(clips)
+        self.sums = sum(self._added, self.sums)
+        self.latest = None
+
+    def compute(self) -> Tensor:
+        """The score over all sequences so far, a float64 scalar."""
+        if int(self.counts[1]) == 0:
+            self.refuse_to_compute(int(self.counts[4]))
+        return self.score(self.sums)
+
+    def check_denominator(self, sums: Tensor) -> None:
+        """Refuse to divide by zero."""
+        if bool((sums == 0).any()):
+            self.leave_synchronised_state()
+            raise ValueError(f"{type(self).__name__} would divide by zero: {self.divides_by}")
 
 
 # The functional form.

@@ -114,13 +114,10 @@ class Request:
         accepted = inspect.signature(implementation).parameters
         arguments = {key: value for need in self.needs for key, value in context.has[need].items() if key in accepted}
         options = dict(self.options)
-        region = options.get("region")
-        if getattr(implementation, "of_channels", False):
-            region = region or implementation.usual_channels
+        region = options.get("region", "all" if self.of_channels else None)
         if isinstance(region, str):  # a region that is given as an option by the name of its need
             regions = {need: value for need in ("lips", "upper_face") for value in context.has.get(need, {}).values()}
-            if getattr(implementation, "of_channels", False):
-                regions = dict(context.channels)
+            regions = dict(context.channels) if self.of_channels else regions
             check_known(f"metric {self.text}", "region", [region], regions)
             options["region"] = regions[region]
         with damaged(f"metric {self.text}", "change its options"):

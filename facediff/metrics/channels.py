@@ -6,7 +6,6 @@ are prediction and truth in the formulas, both (frames, D).
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, Unpack, cast
 
@@ -20,14 +19,14 @@ from facediff.metrics.base import (
     SequenceMetric,
     SequenceOptions,
     Side,
+    SumsMetric,
     UpdateOptions,
     check_option,
     check_range,
     functional,
-    of_side,
 )
-from facediff.metrics.mouth import OpeningMetric, correlation
-from facediff.metrics.regions import LipPairsLike, RegionLike
+from facediff.metrics.mouth import correlation
+from facediff.metrics.regions import RegionLike, as_region
 from facediff.registry import metric
 
 
@@ -44,8 +43,6 @@ class ChannelMetric(SequenceMetric):
     """Whether the metric reads channels where motion has a rig that decodes them."""
     option_needs: ClassVar[Mapping[str, str]] = {}
     """Further needs where an option is on."""
-    usual_channels: ClassVar[str] = "all"
-    """The group of channels that is taken where a metric is chosen by name and no region."""
 
     def __init__(
         self, region: RegionLike | None = None, *, definition: str | None = None, **options: Unpack[SequenceOptions]
@@ -86,7 +83,9 @@ class OneSideMetric(ChannelMetric):
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The score of one sequence."""
-        return of_side(self.of, clip, lambda motion: self.of_motion(self.flat(motion)))
+        sides = {"prediction": clip.prediction, "truth": clip.truth}
+        scores = [self.of_motion(self.flat(sides[side])) for side in sides if self.of in (side, "gap")]
+        return scores[0] - scores[1] if self.of == "gap" else scores[0]
 
 
 @metric.register("channel_variance")
@@ -209,44 +208,6 @@ class StepDistance(ChannelMetric):
 step_distance = functional(StepDistance)
 
 
-@metric.register("lip_dynamics_deviation")
-class LipDynamicsDeviation(OpeningMetric):
-    r"""LDD: by how much the spread of the mouth's opening over time is off, \|std o_p − std o_g\|.
-
-    The opening o is as in :class:`MouthOpeningDifference`, the standard deviation the population's. The code of
-    ARTalk and UniLS has it commented out; mean over sequences.
-
-    Args:
-        scale: factor of all lengths: 1000 gives millimetres where vertices are in metres.
-
-    >>> import torch
-    >>> closed, ajar = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
-    >>> ajar[1, 0, 1] = 1.0
-    >>> lip_dynamics_deviation(closed, ajar, [(0, 1)]).item()
-    0.5
-    """
-
-    higher_is_better = False
-
-    def __init__(self, pairs: LipPairsLike, *, scale: float = 1.0, **options: Unpack[SequenceOptions]) -> None:
-        check_range("scale", scale, 1e-12)
-        unit = "unit" if scale == 1.0 else f"unit of lengths times {scale:g}"
-        definition = (
-            "in each sequence the difference, without sign, between the standard deviations over time of the mouth's "
-            f"openings, an opening being the mean distance of {{pairs}}; mean over sequences [{unit}]"
-        )
-        super().__init__(pairs, definition=definition, **options)
-        self.scale = scale
-
-    def clip_value(self, clip: Clip) -> Tensor:
-        """The deviation of one sequence."""
-        predicted, true = self.openings(clip)
-        return self.scale * (predicted.std(correction=0) - true.std(correction=0)).abs()
-
-
-lip_dynamics_deviation = functional(LipDynamicsDeviation)
-
-
 # Conversations: the motion of the partner is read too.
 
 
@@ -302,35 +263,8 @@ residual_partner_correlation = functional(ResidualPartnerCorrelation)
 # Distances of distributions over all frames of all sequences.
 
 
-class DistributionMetric(ChannelMetric):
-    """Base of metrics over all frames of all sequences, which have no value of a single sequence."""
-
-    def clip_weight(self, clip: Clip) -> int:
-        """Its frames; the score is no mean over sequences."""
-        return clip.frames
-
-    def clip_value(self, clip: Clip) -> Tensor:
-        """None of its own."""
-        return torch.zeros((), dtype=torch.float64, device=clip.truth.device)
-
-    @abstractmethod
-    def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
-        """Add frames (frames, D) of both sides to the states."""
-
-    def add(self, clips: Clips) -> None:
-        """Check aligned sequences and add their frames; nothing is added where one is refused."""
-        super().add(clips)
-        for clip in clips.clips:
-            sides = [self.flat(side) for side in (clip.prediction, clip.truth)]
-            if clip.partner is not None:
-                sides = [torch.cat([self.flat(clip.partner), side], 1) for side in sides]
-            self.add_frames(*sides)
-        # The score is no mean of the sequences' values; combining sequences means adding up states.
-        self.latest = None
-
-
 @metric.register("frechet_distance")
-class FrechetDistance(DistributionMetric):
+class FrechetDistance(SumsMetric, ChannelMetric):
     r"""FD: Fréchet distance between the distributions of frames of prediction and truth, as Gaussians.
 
     \|μ_x − μ_y\|² + tr(Σ_x + Σ_y − 2 (Σ_x Σ_y)^½) over all frames of all sequences, Σ with n − 1 as NumPy's ``cov``; of
@@ -352,8 +286,6 @@ class FrechetDistance(DistributionMetric):
 
     higher_is_better = False
     option_needs: ClassVar[Mapping[str, str]] = {"with_partner": "partner"}
-    sums: Tensor
-    products: Tensor
 
     def __init__(
         self,
@@ -367,18 +299,22 @@ class FrechetDistance(DistributionMetric):
             raise ValueError("the Fréchet distance needs its channels; give a region, such as region=expression")
         frame = "the partner's frame followed by the person's own" if with_partner else "frames"
         definition = f"Fréchet distance between Gaussians of {frame}, over {{region}}, all sequences together [unit²]"
-        super().__init__(region, definition=definition, **options)
+        region = as_region(region, "channels")
+        size = region.count * dims * (2 if with_partner else 1)
+        super().__init__(shape=(2, 1 + size, size), region=region, definition=definition, **options)
         self.with_partner = with_partner
         self.dims = dims
-        size = len(self.region.indices) * dims * (2 if with_partner else 1) if self.region is not None else 0
-        self.add_state("sums", torch.zeros(2, size, dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("products", torch.zeros(2, size, size, dtype=torch.float64), dist_reduce_fx="sum")
 
-    def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
-        """Add to the sums and to the sums of products."""
-        sides = torch.stack([prediction, truth])
-        self.sums = self.sums + sides.sum(1)
-        self.products = self.products + sides.mT @ sides
+    def clip_weight(self, clip: Clip) -> int:
+        """Its frames; the score is no mean over sequences."""
+        return clip.frames
+
+    def clip_sums(self, clip: Clip) -> Tensor:
+        """Of either side, the sum of the frames and of their products."""
+        sides = torch.stack([self.flat(side) for side in (clip.prediction, clip.truth)])
+        if clip.partner is not None:
+            sides = torch.cat([self.flat(clip.partner).expand(2, -1, -1), sides], 2)
+        return torch.cat([sides.sum(1, keepdim=True), sides.mT @ sides], 1)
 
     def update(
         self, prediction: Tensor, truth: Tensor, *, partner: Tensor | None = None, **batch: Unpack[UpdateOptions]
@@ -394,18 +330,13 @@ class FrechetDistance(DistributionMetric):
             clips = attach_partners(clips, partner, single=truth.ndim == 3)
         self.add(clips)
 
-    def compute(self) -> Tensor:
-        """The distance over all frames so far, a float64 scalar.
-
-        NaN of a single frame, which has no covariance.
-        """
+    def score(self, sums: Tensor) -> Tensor:
+        """The distance; NaN of a single frame, which has no covariance."""
         frames = int(self.counts[0])
-        if int(self.counts[1]) == 0:
-            self.refuse_to_compute(0)
         if frames < 2:
-            return torch.full_like(self.sums[0, 0], torch.nan)
-        means = self.sums / frames
-        covariances = (self.products - frames * means[:, :, None] * means[:, None, :]) / (frames - 1)
+            return torch.full_like(sums[0, 0, 0], torch.nan)
+        means = sums[:, 0] / frames
+        covariances = (sums[:, 1:] - frames * means[:, :, None] * means[:, None, :]) / (frames - 1)
         # tr (A B)^½ is the sum of the roots of the eigenvalues of A^½ B A^½, which is symmetric.
         values, vectors = torch.linalg.eigh(covariances[0])
         root = vectors * values.clamp_min(0).sqrt() @ vectors.T
@@ -455,7 +386,7 @@ def nearest_centres(frames: Tensor, centres: Tensor) -> Tensor:
 
 
 @metric.register("shannon_index")
-class ShannonIndex(DistributionMetric):
+class ShannonIndex(ChannelMetric):
     """SID: how evenly a prediction visits the clusters of the truth's frames, entropy of their histogram in bits.
 
     k-means finds ``clusters`` centres of all the truth's frames, each predicted frame gets the label of the nearest,
@@ -514,18 +445,25 @@ class ShannonIndex(DistributionMetric):
         super().reset()
         self._begin()
 
+    def clip_weight(self, clip: Clip) -> int:
+        """Its frames; the score is no mean over sequences."""
+        return clip.frames
+
+    def clip_value(self, clip: Clip) -> Tensor:
+        """Zero, which does not enter the score."""
+        return torch.zeros((), dtype=torch.float64, device=clip.truth.device)
+
     def add(self, clips: Clips) -> None:
         """Check aligned sequences and keep their frames; nothing is kept where one is refused."""
         width = clips.dims * (clips.n_vertices if self.region is None else self.region.count)
         if int(self.width) not in (0, width):
             raise ValueError(f"frames of {width} numbers after others of {int(self.width)} cannot be compared")
         super().add(clips)
-
-    def add_frames(self, prediction: Tensor, truth: Tensor) -> None:
-        """Keep the frames."""
-        self.width = torch.full_like(self.width, prediction.shape[1])
-        self.predicted.append(prediction.flatten())
-        self.true.append(truth.flatten())
+        for clip in clips.clips:
+            self.width = torch.full_like(self.width, width)
+            self.predicted.append(self.flat(clip.prediction).flatten())
+            self.true.append(self.flat(clip.truth).flatten())
+        self.latest = None
 
     def compute(self) -> Tensor:
         """The entropy over all frames so far, a float64 scalar."""

@@ -10,17 +10,16 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from itertools import combinations
-from typing import Any, ClassVar, Literal, Unpack
+from typing import ClassVar, Literal, Unpack
 
 import torch
 from torch import Tensor
 
 from facediff.metrics.base import (
     Clip,
-    Clips,
     Pooling,
-    SequenceMetric,
     SequenceOptions,
+    SumsMetric,
     check_option,
     check_range,
     functional,
@@ -31,66 +30,47 @@ from facediff.metrics.samples import OfSamples
 from facediff.registry import metric
 
 
-class Denominator(SequenceMetric):
-    """Base of metrics that divide by a sum over all sequences."""
-
-    divides_by: ClassVar[str] = "the denominator is zero on every sequence"
-
-    def check_denominator(self, sums: Tensor) -> None:
-        """Refuse to divide by zero."""
-        if bool((sums == 0).any()):
-            self.leave_synchronised_state()
-            raise ValueError(f"{type(self).__name__} would divide by zero: {self.divides_by}")
-
-
-class RatioMetric(Denominator):
+class RatioMetric(SumsMetric):
     """Base of metrics that divide one sum over all sequences by another; a subclass defines :meth:`clip_parts`.
 
     The mean of each sequence's own ratio would be ruled by the sequences in which hardly anything happens.
     """
 
     unit: ClassVar[str] = "1"
-    parts: Tensor
+    shape: ClassVar[tuple[int, ...]] = (2,)
 
-    def __init__(self, region: RegionLike | None = None, *, definition: str, **options: Any) -> None:  # noqa: ANN401 - the next base's
-        definition = f"{definition}; ratio of sums over all sequences [{self.unit}]"
-        super().__init__(definition=definition, region=region, **options)
-        self.add_state("parts", torch.zeros(2, dtype=torch.float64), dist_reduce_fx="sum")
-        self._latest_parts: list[Tensor] = []
+    def __init__(
+        self, region: RegionLike | None = None, *, definition: str | None = None, **options: Unpack[SequenceOptions]
+    ) -> None:
+        definition = f"{definition or self.words}; ratio of sums over all sequences [{self.unit}]"
+        super().__init__(shape=self.shape, definition=definition, region=region, **options)
 
     @abstractmethod
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Numerator and denominator of one sequence, float64 scalars, or of several ratios."""
 
-    def clip_value(self, clip: Clip) -> Tensor:
-        """The ratio of one sequence; infinity where its denominator is zero."""
-        above, below = self.clip_parts(clip)
-        self._latest_parts.append(torch.stack([above, below]))
-        return (above / below).prod()
+    def clip_sums(self, clip: Clip) -> Tensor:
+        """Numerator and denominator."""
+        return torch.stack(self.clip_parts(clip))
 
-    def add(self, clips: Clips) -> None:
-        """Check aligned sequences and add their parts to the sums; nothing is added where one is refused."""
-        self._latest_parts = []
-        super().add(clips)
-        if self._latest_parts:
-            self.parts = self.parts + torch.stack(self._latest_parts).sum(0)
-        # The score is no mean of the sequences' values; to combine sequences, add up states.
-        self.latest = None
+    def score(self, sums: Tensor) -> Tensor:
+        """The ratio."""
+        self.check_denominator(sums[1])
+        return sums[0] / sums[1]
 
-    def finish(self, ratio: Tensor) -> Tensor:
-        """From the ratio of the sums to the score."""
-        return ratio
 
-    def compute(self) -> Tensor:
-        """The score over all sequences so far, a float64 scalar."""
-        if int(self.counts[1]) == 0:
-            self.refuse_to_compute(0)
-        self.check_denominator(self.parts[1])
-        return self.finish(self.parts[0] / self.parts[1])
+class RootRatioMetric(RatioMetric):
+    """Base of ratios of sums of squares, from which the score takes the root."""
+
+    divides_by = "the truth does not move in any sequence"
+
+    def score(self, sums: Tensor) -> Tensor:
+        """The root of the ratio, or of the product of several."""
+        return super().score(sums).prod().sqrt()
 
 
 @metric.register("motion_liveliness")
-class MotionLiveliness(RatioMetric):
+class MotionLiveliness(RootRatioMetric):
     r"""Liveliness: how much a region moves over time, as a share of how much the truth's does.
 
     With the variance over the frames t of a sequence, σ²(x) = Σ_v ‖x_v[t] − mean_t x_v‖² averaged over t:
@@ -103,21 +83,13 @@ class MotionLiveliness(RatioMetric):
     0.5
     """
 
-    divides_by = "the truth does not move in any sequence"
-
-    def __init__(self, region: RegionLike | None = None, **options: Unpack[SequenceOptions]) -> None:
-        definition = "root of the prediction's variance over time, over that of the truth, over {region}"
-        super().__init__(region, definition=definition, **options)
+    words = "root of the prediction's variance over time, over that of the truth, over {region}"
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Summed squared distance of each side from its own mean over time."""
         regions = [_of(side, self.indices) for side in (clip.prediction, clip.truth)]
         above, below = (region.sub_(region.mean(0)).square_().sum() for region in regions)
         return above, below
-
-    def finish(self, ratio: Tensor) -> Tensor:
-        """A ratio of variances becomes one of deviations."""
-        return ratio.sqrt()
 
 
 motion_liveliness = functional(MotionLiveliness)
@@ -129,7 +101,7 @@ def _differences(motion: Tensor) -> Tensor:
 
 
 @metric.register("frame_step")
-class FrameStep(RatioMetric):
+class FrameStep(RootRatioMetric):
     r"""Frame step: how far a region moves from a frame to the next, as a share of how far the truth's does.
 
     √(Σ ‖x[t+1] − x[t]‖² / Σ ‖y[t+1] − y[t]‖²), over frames, vertices and sequences. 1 is as quick as the truth.
@@ -140,28 +112,20 @@ class FrameStep(RatioMetric):
     0.5
     """
 
-    divides_by = "the truth does not move in any sequence"
     in_order = True
-
-    def __init__(self, region: RegionLike | None = None, **options: Unpack[SequenceOptions]) -> None:
-        definition = "root mean square of the prediction's steps from frame to frame, over that of the truth, {region}"
-        super().__init__(region, definition=definition, **options)
+    words = "root mean square of the prediction's steps from frame to frame, over that of the truth, {region}"
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Summed squared steps of each side."""
         prediction, truth = (_differences(_of(side, self.indices))[0] for side in (clip.prediction, clip.truth))
         return prediction, truth
 
-    def finish(self, ratio: Tensor) -> Tensor:
-        """A ratio of squares becomes one of lengths."""
-        return ratio.sqrt()
-
 
 frame_step = functional(FrameStep)
 
 
 @metric.register("difference_ratio")
-class DifferenceRatio(RatioMetric):
+class DifferenceRatio(RootRatioMetric):
     r"""Difference ratio: how much a region shivers, the size of its second differences in time over its first.
 
     √(Σ ‖x[t+1] − 2x[t] + x[t−1]‖² / Σ ‖x[t+1] − x[t]‖²), over frames, vertices and sequences: √3 for noise that is
@@ -178,6 +142,7 @@ class DifferenceRatio(RatioMetric):
 
     divides_by = "the prediction or the truth does not move in any sequence"
     in_order = True
+    shape = (2, 2)
 
     def __init__(
         self,
@@ -190,7 +155,6 @@ class DifferenceRatio(RatioMetric):
         definition = f"size of second over first differences in time, {of}, over {{region}}"
         super().__init__(region, definition=definition, **options)
         self.of = of
-        self.add_state("parts", torch.zeros(2, 2, dtype=torch.float64), dist_reduce_fx="sum")
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Numerators and denominators of the prediction's ratio, and of one over the truth's."""
@@ -202,16 +166,12 @@ class DifferenceRatio(RatioMetric):
             true_first, true_second = true_second, true_first
         return torch.stack([second, true_first]), torch.stack([first, true_second])
 
-    def finish(self, ratio: Tensor) -> Tensor:
-        """The product of both, from squares to lengths."""
-        return ratio.prod().sqrt()
-
 
 difference_ratio = functional(DifferenceRatio)
 
 
 @metric.register("spectrum_distance")
-class SpectrumDistance(Denominator):
+class SpectrumDistance(SumsMetric):
     r"""Spectrum distance: by how many decibels the power of a region's motion is off, mean over octaves.
 
     Of every sequence, offsets are taken from their mean over time, multiplied by the window w[t] = sin(π(t + ½)/T) and
@@ -230,10 +190,8 @@ class SpectrumDistance(Denominator):
     20.0
     """
 
-    unit: ClassVar[str] = "dB"
     divides_by = "the truth does not move in any sequence"
     in_order = True
-    powers: Tensor
 
     def __init__(
         self, region: RegionLike | None = None, *, octaves: int = 5, **options: Unpack[SequenceOptions]
@@ -242,12 +200,10 @@ class SpectrumDistance(Denominator):
         definition = (
             f"mean over {octaves} octaves of the decibels by which the power over time is off, over {{region}} [dB]"
         )
-        super().__init__(definition=definition, region=region, **options)
+        super().__init__(shape=(2, octaves), definition=definition, region=region, **options)
         self.octaves = octaves
-        self.add_state("powers", torch.zeros(2, octaves, dtype=torch.float64), dist_reduce_fx="sum")
-        self._latest_powers: list[Tensor] = []
 
-    def clip_powers(self, clip: Clip) -> Tensor:
+    def clip_sums(self, clip: Clip) -> Tensor:
         """Power of prediction and truth in each octave, the quickest first, of one sequence (2, octaves), float64."""
         powers = []
         for side in (clip.prediction, clip.truth):
@@ -264,36 +220,14 @@ class SpectrumDistance(Denominator):
             powers.append(power.new_zeros(self.octaves).index_add(0, octave, power))
         return torch.stack(powers)
 
-    def clip_value(self, clip: Clip) -> Tensor:
-        """The score of one sequence."""
-        powers = self.clip_powers(clip)
-        self._latest_powers.append(powers)
-        return _decibels(powers)
-
-    def add(self, clips: Clips) -> None:
-        """Check aligned sequences and add their powers to the sums; nothing is added where one is refused."""
-        self._latest_powers = []
-        super().add(clips)
-        if self._latest_powers:
-            self.powers = self.powers + torch.stack(self._latest_powers).sum(0)
-        # The score is no mean of the sequences' values; to combine sequences, add up states.
-        self.latest = None
-
-    def compute(self) -> Tensor:
-        """The score over all sequences so far, a float64 scalar."""
-        if int(self.counts[1]) == 0:
-            self.refuse_to_compute(0)
-        self.check_denominator(self.powers[1].sum())
-        return _decibels(self.powers)
+    def score(self, sums: Tensor) -> Tensor:
+        """Mean over octaves of the distance in dB."""
+        self.check_denominator(sums[1].sum())
+        prediction, truth = sums.clamp_min(1e-6 * float(sums[1].sum()))
+        return (10 * (prediction / truth).log10()).abs().mean()
 
 
 spectrum_distance = functional(SpectrumDistance)
-
-
-def _decibels(powers: Tensor) -> Tensor:
-    """Mean over octaves of the distance in dB of two rows of powers."""
-    prediction, truth = powers.clamp_min(1e-6 * float(powers[1].sum()))
-    return (10 * (prediction / truth).log10()).abs().mean()
 
 
 @metric.register("spread_error_ratio")

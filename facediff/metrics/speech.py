@@ -18,17 +18,16 @@ from facediff.metrics.base import (
     Clips,
     Coverage,
     Inferred,
-    SequenceMetric,
     SequenceOptions,
     Side,
+    SumsMetric,
     UpdateOptions,
     check_option,
     check_range,
     functional,
-    of_side,
     whole_numbers,
 )
-from facediff.metrics.mouth import correlation, speed
+from facediff.metrics.mouth import speed
 from facediff.metrics.regions import RegionLike, as_region
 from facediff.registry import metric
 
@@ -57,119 +56,6 @@ def speech_intensity(waveform: Tensor, frames: int, sample_rate: int, frames_per
     return (torch.zeros_like(lengths, dtype=torch.float64).index_add_(0, frame_of_sample, power) / lengths).sqrt()
 
 
-class SpeechLipMetric(SequenceMetric):
-    """Base of metrics that compare the lips' motion with the intensity of the speech.
-
-    Args:
-        lips: lip vertices, a :class:`Region` or indices.
-        of: the lips of the ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
-        sample_rate: samples of the speech per second; needed for waveforms, not for intensities.
-        frames_per_second: of the motion; needed with ``sample_rate``.
-        **options: see :class:`SequenceOptions`; NaN and infinity in the speech are always refused.
-    """
-
-    needs: ClassVar[tuple[str, ...]] = ("lips", "speech")
-    indices: Tensor
-
-    def __init__(
-        self,
-        lips: RegionLike,
-        *,
-        definition: str | None = None,
-        of: Side = "prediction",
-        sample_rate: int | None = None,
-        frames_per_second: float | None = None,
-        **options: Unpack[SequenceOptions],
-    ) -> None:
-        check_option("of", of, Side)
-        if sample_rate is not None:
-            check_range("frames_per_second", frames_per_second or 0.0, 1e-9, sample_rate)
-        definition = (definition or self.words).replace("{side}", SIDE_WORDS[of])
-        super().__init__(definition=definition, region=as_region(lips, "lips"), **options)
-        self.of: Side = of
-        self.sample_rate = sample_rate
-        self.frames_per_second = frames_per_second
-
-    def update(
-        self,
-        prediction: Tensor,
-        truth: Tensor,
-        *,
-        waveform: Tensor | None = None,
-        intensity: Tensor | None = None,
-        **batch: Unpack[UpdateOptions],
-    ) -> None:
-        """Add a batch of sequences with their speech; see :meth:`SequenceMetric.update`.
-
-        ``waveform`` is the sound (batch, samples), or (samples,) of one sequence, at the metric's ``sample_rate``,
-        beginning with the first frame; samples beyond the scored frames are not read. ``intensity`` is given instead of
-        it: the intensity of each frame, (batch, frames) or (frames,).
-        """
-        clips = self.align(prediction, truth, **batch)
-        self.add(self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3))
-
-    def attach_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
-        """The sequences with the intensity of their speech; ``single`` for one sequence without batch axis."""
-        if waveform is not None and (intensity is not None or self.sample_rate is None):
-            raise ValueError("give intensity=, or waveform= to a metric made with sample_rate= and frames_per_second=")
-        if waveform is not None:
-            rows = clips.rows("waveform", waveform, single=single, ndim=2)
-            rate = float(self.frames_per_second or 0)
-            frame_counts = [
-                speech_intensity(row, clip.frames, int(self.sample_rate or 0), rate)
-                for clip, row in zip(clips.clips, rows, strict=True)
-            ]
-        else:
-            rows = clips.rows("intensity", intensity, single=single, ndim=2)
-            frame_counts = [row[: clip.frames].double() for clip, row in zip(clips.clips, rows, strict=True)]
-            if any(len(speech) < clip.frames for clip, speech in zip(clips.clips, frame_counts, strict=True)):
-                raise ValueError("an intensity has fewer frames than its motion; cut the motion, or fill up with zeros")
-        return clips.attach(
-            "speech", [speech.to(self.counts.device) for speech in clips.finite("speech", frame_counts)]
-        )
-
-
-@metric.register("frame_speech_lip_correlation")
-class FrameSpeechLipCorrelation(SpeechLipMetric):
-    """Speech–lip intensity correlation (SLCC) over the frames of each sequence.
-
-    Per sequence Pearson's correlation over frames, from the second on, between the speech's intensity s[t] and
-    the lips' m[t] (see :mod:`facediff.metrics.speech`); then the mean over sequences. From −1 to 1, without unit; the
-    scale of sound and mesh does not matter, nor does a template.
-
-    ``of="gap"`` is the prediction's minus the truth's: negative where the lips follow loudness less
-    than the truth's. Lips that do not vary count 0; a sequence of speech that does not vary, or with fewer
-    than three frames, is left out and counted by :meth:`coverage`.
-
-    The SLCC of "Perceptually Accurate 3D Talking Head Generation" (Chae-Yeon et al., CVPR 2025) is taken over clips
-    instead: :class:`ClipSpeechLipCorrelation`. This one asks the same within a sentence; the definition is ours.
-
-    >>> import torch
-    >>> loudness = torch.tensor([0.0, 1.0, 3.0, 2.0])
-    >>> motion = loudness.cumsum(0)[:, None, None].expand(4, 5, 3)
-    >>> round(frame_speech_lip_correlation(motion, motion, [0, 1], intensity=loudness).item(), 6)
-    1.0
-    """
-
-    leaves_out = "the intensity of the speech does not vary"
-    words = (
-        "in each sequence the Pearson correlation over frames between the intensity of the speech (root mean square of "
-        "a frame) and the mean speed of {region}, {side}; mean over sequences; lips that do not vary count 0, a "
-        "sequence whose speech does not vary is left out [1]"
-    )
-
-    def clip_value(self, clip: Clip) -> Tensor:
-        """The correlation of one sequence, NaN if its speech does not vary."""
-
-        def follow(motion: Tensor) -> Tensor:
-            return correlation(clip.speech[1:], speed(motion, self.indices))
-
-        return of_side(self.of, clip, follow)
-
-
-frame_speech_lip_correlation = functional(FrameSpeechLipCorrelation)
-
-
 # Columns of the sums that are kept for each identity; for the lips the sum, sum of squares, and sum of products with
 # the speech.
 _CLIPS, _FRAMES, _SPEECH, _SPEECH_SQUARED = range(4)
@@ -182,7 +68,7 @@ def _identity_count(arguments: Mapping[str, Any]) -> int:
 
 
 @metric.register("clip_speech_lip_correlation")
-class ClipSpeechLipCorrelation(SpeechLipMetric):
+class ClipSpeechLipCorrelation(SumsMetric):
     """Speech–lip intensity correlation coefficient (SLCC) over clips.
 
     Each clip gives one intensity of its speech, S = √(mean_t s[t]²), and one of its lips,
@@ -202,7 +88,11 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
     Memory grows with ``n_identities``, not with clips or frames.
 
     Args:
+        lips: lip vertices, a :class:`Region` or indices.
         n_identities: how many identities there are; 1 standardises over all clips together.
+        of: the lips of the ``"prediction"``, ``"truth"`` or ``"gap"``, the prediction's minus the truth's.
+        sample_rate: samples of the speech per second; needed for waveforms, not for intensities.
+        frames_per_second: of the motion; needed with ``sample_rate``.
 
     >>> import torch
     >>> loudness = torch.tensor([[1.0], [2.0], [4.0]]).expand(3, 5)
@@ -214,7 +104,7 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
     leaves_out = "no identity has two clips of two frames that are not equally loud"
     needs: ClassVar[tuple[str, ...]] = ("lips", "speech", "identities")
     inferred: ClassVar[Inferred] = {"n_identities": _identity_count}
-    moments: Tensor
+    indices: Tensor
 
     def __init__(
         self,
@@ -226,17 +116,21 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         frames_per_second: float | None = None,
         **options: Unpack[SequenceOptions],
     ) -> None:
+        check_option("of", of, Side)
         check_range("n_identities", n_identities, 1)
+        if sample_rate is not None:
+            check_range("frames_per_second", frames_per_second or 0.0, 1e-9, sample_rate)
         definition = (
             "Pearson correlation over clips between the intensity of the speech and the root mean square "
             f"over frames of the mean speed of {{region}}, each standardised within {n_identities} identities, "
-            "{side} [1]"
+            f"{SIDE_WORDS[of]} [1]"
         )
-        super().__init__(
-            lips, definition=definition, of=of, sample_rate=sample_rate, frames_per_second=frames_per_second, **options
-        )
+        region = as_region(lips, "lips")
+        super().__init__(shape=(n_identities, 10), definition=definition, region=region, **options)
         self.n_identities = n_identities
-        self.add_state("moments", torch.zeros(n_identities, 10, dtype=torch.float64), dist_reduce_fx="sum")
+        self.of: Side = of
+        self.sample_rate = sample_rate
+        self.frames_per_second = frames_per_second
 
     def update(
         self,
@@ -248,9 +142,12 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
         intensity: Tensor | None = None,
         **batch: Unpack[UpdateOptions],
     ) -> None:
-        """Add a batch of sequences with their speech; see :meth:`SpeechLipMetric.update`.
+        """Add a batch of sequences with their speech; see :meth:`SequenceMetric.update`.
 
-        ``identities`` has the number of each sequence's identity, below ``n_identities``; needed unless there is one.
+        ``waveform`` is the sound (batch, samples), or (samples,) of one sequence, at the metric's ``sample_rate``,
+        beginning with the first frame; samples beyond the scored frames are not read. ``intensity`` is given instead of
+        it: the intensity of each frame, (batch, frames) or (frames,). ``identities`` has the number of each sequence's
+        identity, below ``n_identities``; needed unless there is one.
         """
         clips = self.align(prediction, truth, **batch)
         clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)
@@ -259,37 +156,39 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
             identities = [0] * count if self.n_identities == 1 else []
         self.add(clips.attach("identity", whole_numbers("identities", identities, count, self.n_identities - 1)))
 
+    def attach_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
+        """The sequences with the intensity of their speech; ``single`` for one sequence without batch axis."""
+        if waveform is not None and (intensity is not None or self.sample_rate is None):
+            raise ValueError("give intensity=, or waveform= to a metric made with sample_rate= and frames_per_second=")
+        if waveform is not None:
+            rows = clips.rows("waveform", waveform, single=single, ndim=2)
+            rates = int(self.sample_rate or 0), float(self.frames_per_second or 0)
+            speech = [speech_intensity(row, clip.frames, *rates) for clip, row in zip(clips.clips, rows, strict=True)]
+        else:
+            rows = clips.rows("intensity", intensity, single=single, ndim=2)
+            speech = [row[: clip.frames].double() for clip, row in zip(clips.clips, rows, strict=True)]
+            if any(len(frames) < clip.frames for clip, frames in zip(clips.clips, speech, strict=True)):
+                raise ValueError("an intensity has fewer frames than its motion; cut the motion, or fill up with zeros")
+        return clips.attach("speech", [row.to(self.counts.device) for row in clips.finite("speech", speech)])
+
     def clip_value(self, clip: Clip) -> Tensor:
-        """Intensities of speech, predicted lips and true lips, (3,) float64; NaN for a clip of one frame."""
-        lips = [speed(motion, self.indices).square().mean().sqrt() for motion in (clip.prediction, clip.truth)]
-        return torch.stack([clip.speech.square().mean().sqrt(), *lips])
+        """NaN for a clip of one frame, which has no motion."""
+        return super().clip_value(clip) if clip.frames > 1 else torch.full_like(self.sums[0, 0], torch.nan)
 
-    def add(self, clips: Clips) -> None:
-        """Add each clip's intensities to the sums of its identity; see :meth:`SequenceMetric.add`."""
-        self.check_vertices(clips.n_vertices)
-        if self.check_finite:
-            clips.check_finite()
-        sums = torch.zeros(self.moments.shape, dtype=torch.float64)
-        left_out = 0
-        for clip in clips.clips:
-            if clip.frames < 2:
-                left_out += 1
-                continue
-            speech, predicted, true = self.clip_value(clip).tolist()
-            row = [1, clip.frames, speech, speech**2]
-            row += [power for lips in (predicted, true) for power in (lips, lips**2, lips * speech)]
-            sums[clip.identity] += torch.tensor(row, dtype=torch.float64)
-        cut = torch.tensor([0, 0, clips.cut_prediction, clips.cut_truth, left_out])
-        self.moments = self.moments + sums.to(self.moments.device)
-        self.counts = self.counts + cut.to(self.counts.device)
+    def clip_sums(self, clip: Clip) -> Tensor:
+        """The clip's intensities in the row of its identity."""
+        speech = clip.speech.square().mean().sqrt()
+        row = [torch.ones_like(speech), torch.full_like(speech, clip.frames), speech, speech**2]
+        for motion in (clip.prediction, clip.truth):
+            lips = speed(motion, self.indices).square().mean().sqrt()
+            row += [lips, lips**2, lips * speech]
+        sums = torch.zeros_like(self.sums)
+        sums[clip.identity] = torch.stack(row)
+        return sums
 
-    def _enter(self) -> Tensor:
-        """Which identities have clips that differ in loudness, (n_identities,) bool."""
-        return (self.moments[:, _CLIPS] > 1) & (_deviation(self.moments, _SPEECH, _SPEECH_SQUARED) > 0)
-
-    def compute(self) -> Tensor:
-        """The correlation over all clips so far, a float64 scalar."""
-        moments = self.moments[self._enter()]
+    def score(self, sums: Tensor) -> Tensor:
+        """The correlation over the clips of identities that enter."""
+        moments = sums[_enters(sums)]
         if not len(moments):
             self.refuse_to_compute(self.covered().left_out)
         if self.of == "gap":
@@ -298,13 +197,17 @@ class ClipSpeechLipCorrelation(SpeechLipMetric):
 
     def covered(self) -> Coverage:
         """Sequences of this process that were scored, cut and left out."""
-        moments, all_clips = self.moments[self._enter()], int(self.moments[:, _CLIPS].sum())
-        sequences, frames = int(moments[:, _CLIPS].sum()), int(moments[:, _FRAMES].sum())
-        cut_prediction, cut_truth, left_out = self.counts[2:].tolist()
-        return Coverage(frames, sequences, cut_prediction, cut_truth, left_out + all_clips - sequences)
+        sequences, frames = (int(self.sums[_enters(self.sums), column].sum()) for column in (_CLIPS, _FRAMES))
+        left_out = int(self.counts[4] + self.sums[:, _CLIPS].sum()) - sequences
+        return Coverage(frames, sequences, *self.counts[2:4].tolist(), left_out)
 
 
 clip_speech_lip_correlation = functional(ClipSpeechLipCorrelation)
+
+
+def _enters(moments: Tensor) -> Tensor:
+    """Which identities have clips that differ in loudness, (n_identities,) bool."""
+    return (moments[:, _CLIPS] > 1) & (_deviation(moments, _SPEECH, _SPEECH_SQUARED) > 0)
 
 
 def _standardised_correlation(moments: Tensor, side: str) -> Tensor:

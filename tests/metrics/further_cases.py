@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import linalg, ndimage
+from scipy import linalg
 from torch import Tensor
 
 import facediff.metrics as fm
@@ -311,15 +311,6 @@ def frame_loudness(corpus: Corpus, place: int, *, given: str) -> Array:
     return np.array([np.sqrt(np.mean(samples[a:b] ** 2)) for a, b in zip(edges[:-1], edges[1:], strict=True)])
 
 
-def frame_slcc(corpus: Corpus, place: int, *, of: str, given: str) -> tuple[float, float] | None:
-    p, g = sides(corpus, place)
-    s = frame_loudness(corpus, place, given=given)[1:]
-    if len(s) < 2:
-        return None
-    of_p, of_g = (float(np.corrcoef(s, speed(x))[0, 1]) for x in (p, g))
-    return {"prediction": of_p, "truth": of_g, "gap": of_p - of_g}[of], 1
-
-
 def clip_slcc(corpus: Corpus, *, of: str, n_identities: int) -> float:
     """As the released scripts go about it: standardise within each identity, then correlate what there is."""
     places = [place for place in range(len(corpus.truths)) if len(corpus.truths[place]) > 1]
@@ -331,7 +322,8 @@ def clip_slcc(corpus: Corpus, *, of: str, n_identities: int) -> float:
             values[whose == k] = (values[whose == k] - values[whose == k].mean()) / values[whose == k].std(ddof=1)
         return values
 
-    s = standard([np.sqrt(np.mean(loudness(corpus, place) ** 2)) for place in places])
+    given = "waveform" if n_identities == 1 else "intensity"
+    s = standard([np.sqrt(np.mean(frame_loudness(corpus, place, given=given) ** 2)) for place in places])
     r = {}
     for side, name in enumerate(("prediction", "truth")):
         lips = standard([np.sqrt(np.mean(speed(sides(corpus, place)[side]) ** 2)) for place in places])
@@ -462,11 +454,6 @@ def steps_off(corpus: Corpus, place: int) -> tuple[float, float]:
     return float(np.sqrt(np.sum((np.diff(p, axis=0) - np.diff(g, axis=0)) ** 2 / 0.1))), 1
 
 
-def opening_spread_off(corpus: Corpus, place: int) -> tuple[float, float]:
-    p, g = map(opening, sides(corpus, place))
-    return abs(p.std() - g.std()), 1
-
-
 def residual_correlation(corpus: Corpus, place: int) -> tuple[float, float]:
     p, g = (flat(x).ravel() for x in sides(corpus, place))
     q = flat(partner_of(corpus, place)).ravel()
@@ -485,24 +472,6 @@ def frechet(corpus: Corpus, *, partner: bool, region: Sequence[int]) -> float:
     a, b = (np.cov(x, rowvar=False) for x in frames)
     gap = frames[0].mean(0) - frames[1].mean(0)
     return float(gap @ gap + np.trace(a + b - 2 * np.real(linalg.sqrtm(a @ b))))
-
-
-def beat_alignment(corpus: Corpus, place: int, *, of: str) -> tuple[float, float] | None:
-    """By SciPy's filter, from the onsets of the package, which are tested apart."""
-    frames = len(corpus.truths[place])
-    scored = torch.from_numpy(sound(corpus, place)[: int(frames * RATE / FPS)])
-    beats = fm.onsets(scored, RATE).numpy() * FPS
-    if not len(beats):
-        return None
-
-    def score(x: Array) -> float:
-        speed = np.linalg.norm(np.diff(x, axis=0), axis=1)
-        speed = ndimage.gaussian_filter1d(speed, 1.0, mode="reflect") if len(speed) else speed
-        slow = [t + 0.5 for t in range(1, len(speed) - 1) if speed[t - 1] > speed[t] < speed[t + 1]]
-        gaps = [min(abs(beat - t) for t in slow) for beat in beats] if slow else []
-        return float(np.mean(np.exp(-np.square(gaps) / 4.0))) if slow else 0.0
-
-    return one_side(corpus, place, of=of, score=score)
 
 
 # --- the table --------------------------------------------------------------------------------------------
@@ -557,14 +526,11 @@ def _cases() -> list[Case]:
     for word, batch in (("absolute", pair_batch), ("offsets", offsets_batch)):
         add(fm.LipOpeningCorrelation, pairs, {}, batch, pooled(opening_correlation, "sequences"), word)
     add(fm.LipSpeedCorrelation, lips, {}, pair_batch, pooled(speed_correlation, "sequences"))
-    for of, (given, batch) in product(subjects, (("intensity", intensity_batch), ("waveform", sound_batch))):
-        options = {"of": of} | ({"sample_rate": RATE, "frames_per_second": FPS} if given == "waveform" else {})
-        expected = pooled(partial(frame_slcc, of=of, given=given), "sequences")
-        add(fm.FrameSpeechLipCorrelation, lips, options, batch, expected)
     for of, n_identities in product(subjects, (1, 2)):
         expected = partial(clip_slcc, of=of, n_identities=n_identities)
-        batch, only = identity_batch if n_identities > 1 else intensity_batch, {"n_identities": n_identities}
-        add(fm.ClipSpeechLipCorrelation, lips, {"of": of}, batch, expected, str(n_identities), only)
+        batch, only = identity_batch if n_identities > 1 else sound_batch, {"n_identities": n_identities}
+        options = {"of": of} | ({"sample_rate": RATE, "frames_per_second": FPS} if n_identities == 1 else {})
+        add(fm.ClipSpeechLipCorrelation, lips, options, batch, expected, str(n_identities), only)
     several_samples = {"n_samples": SAMPLES}
     for cls, make in ((fm.MeanEstimateError, mean_estimate), (fm.CoverageError, coverage)):
         for squared, pooling in product((True, False), poolings):
@@ -607,12 +573,8 @@ def _cases() -> list[Case]:
         ):
             expected = pooled(partial(one_side, of=of, score=score), "sequences")
             add(cls, of_lips, options | {"of": of}, pair_batch, expected)
-        options = {"smoothing": 1.0, "variance": 2.0, "sample_rate": RATE, "frames_per_second": FPS, "of": of}
-        expected = pooled(partial(beat_alignment, of=of), "sequences")
-        add(fm.HeadBeatAlignment, of_lips, options, sound_batch, expected)
     for cls, formula in ((fm.ChannelDynamicsDeviation, spread_off), (fm.StepDistance, steps_off)):
         add(cls, of_lips, {}, pair_batch, pooled(formula, "sequences"))
-    add(fm.LipDynamicsDeviation, pairs, {}, pair_batch, pooled(opening_spread_off, "sequences"))
     add(fm.ResidualPartnerCorrelation, of_lips, {}, partner_batch, pooled(residual_correlation, "sequences"))
     for partner, region in ((False, LIPS[:1]), (True, LIPS[:2])):
         batch, expected = partner_batch if partner else pair_batch, partial(frechet, partner=partner, region=region)

@@ -13,7 +13,6 @@ from facediff.metrics import (
     Coverage,
     LipOpeningCorrelation,
     clip_speech_lip_correlation,
-    frame_speech_lip_correlation,
     lip_opening_correlation,
     lip_speed_correlation,
     speech_intensity,
@@ -63,13 +62,8 @@ def test_a_series_varies_by_more_than_rounding(share: float, varies: bool, sign:
 def test_lips_that_do_not_vary_follow_no_voice() -> None:
     still = torch.zeros(2, 8, 4, 3)
     loud = torch.rand(2, 8, generator=torch.manual_seed(0))
-    assert frame_speech_lip_correlation(still, motion(0), [0], intensity=loud).item() == 0
-    gap = frame_speech_lip_correlation(still, motion(0), [0], intensity=loud, of="gap")
-    assert gap == -frame_speech_lip_correlation(still, motion(0), [0], intensity=loud, of="truth")
     assert clip_speech_lip_correlation(still, motion(0), [0], intensity=loud).item() == 0
     monotone = torch.full((2, 8), 0.3)
-    with pytest.raises(ValueError, match="the intensity of the speech does not vary"):
-        frame_speech_lip_correlation(motion(0), motion(1), [0], intensity=monotone)
     with pytest.raises(ValueError, match="on any of its 2 sequences: no identity has two clips"):
         clip_speech_lip_correlation(motion(0), motion(1), [0], intensity=monotone)
 
