@@ -191,7 +191,7 @@ class AnimationControls(CheckedOptions):
         blinks: blinks a minute (17 if no number)
         gaze: eyes that wander by so much at most (4 if no number)
         sway: a head that sways by so much at most (2 if no number)
-        eyes: where lids and eyeballs are (.json or .npz, see docs/animation_controls.md); the built-in puppet needs
+        eyes: where lids and eyeballs are (.json, see docs/animation_controls.md); the built-in puppet needs
             none
         controls_seed: seed of blinks, gaze, sway and acting (default: the seed of the noise, or 0)
         direction: keys over time of style, expressiveness, brows, head and others (.json, .csv, or an .npz that was

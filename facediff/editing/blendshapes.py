@@ -419,7 +419,7 @@ def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions)
     """The shapes of a set that move vertices which count."""
     vertices = np.arange(len(animation.template))
     if options.region is not None:
-        check_factors({options.region: 1.0}, animation.regions, animation.name)
+        check_factors([options.region], animation.regions, animation.name)
         if options.region != ALL:
             vertices = np.unique(np.asarray(animation.regions[options.region], np.int64))
     area = np.ones(len(vertices))

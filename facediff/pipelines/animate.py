@@ -187,7 +187,7 @@ class AnimationPipeline(ABC):
         if options.target_mesh is not None:
             file = None if options.correspondence is None else Path(options.correspondence)
             self.retarget = Retarget(Path(options.target_mesh), file, own_shapes=options.own_shapes)
-        self.direct(keys_of(options.direction, self.frame_rate))
+        self.direct(keys_of(options.direction))
 
     @property
     def stages(self) -> list[Stage]:

@@ -451,7 +451,7 @@ class Animator:
                     direction = direction_for(settings.direction, Path(recording))
                     if direction is not settings.direction:
                         check_directed(replace(settings, direction=direction))
-                        pipeline.direct(keys_of(direction, pipeline.frame_rate))
+                        pipeline.direct(keys_of(direction))
                 recording_speech = speech_of(recording, rate, settings.max_seconds)
                 with pipeline.animations(replace(recording_speech, name=name or recording_speech.name)) as samples:
                     animations.append(samples[0] if settings.samples == 1 else Samples(samples))

@@ -207,7 +207,7 @@ def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: l
             from facediff.editing.controls.direction import read_direction
 
             file = next(iter(_own_files(options, recording)), None)
-            pipeline.direct(None if file is None else read_direction(file, pipeline.frame_rate))
+            pipeline.direct(None if file is None else read_direction(file))
         seed = seed_of_recording(recording, pipeline.seed)
         return list(pipeline.write(speech, output, export, seed=seed)[0])
 

@@ -238,18 +238,6 @@ def test_a_batch_takes_the_keys_of_each_recording(
         model.animate(recordings / "b.wav", direction=recordings, expressivity=0.5, **QUICK)
 
 
-def test_timecodes_count_the_frames_of_the_animation(
-    model: facediff.Animator, speech: np.ndarray, tmp_path: Path
-) -> None:
-    path = tmp_path / "keys.csv"
-    path.write_text("time,channel,value\n00:00:01:24,brows,3\n")
-    made = model.animate(speech, 16_000, direction=path, **QUICK)
-    assert Direction.parse(made.metadata[METADATA], "m").keys[0].time == 1.96
-    path.write_text("time,channel,value\n00:00:01:27,brows,3\n")
-    with pytest.raises(FaceDiffError, match=r"keys\.csv: row 2: time"):
-        model.animate(speech, 16_000, direction=path, **QUICK)
-
-
 def test_command_names_what_is_wrong_and_writes_nothing(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("keys.json").write_text(json.dumps({"keys": rows("brows", "high")}))
     command = ["animate", "speech.wav", "--checkpoint", "demo/puppet.ckpt", "-o", "b.npz", "--direction"]

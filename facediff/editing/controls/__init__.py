@@ -7,15 +7,10 @@ from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationControls, DirectionLike
 from facediff.errors import OptionError, refuse_idle
-from facediff.utils.limits import FRAME_RATES
 
 # What edits an animation is imported where it is asked for: most animations have no controls.
 if TYPE_CHECKING:
     from facediff.editing.controls.direction import Direction
-
-
-UNCHECKED = FRAME_RATES[1]
-"""Frame rate for reading frames and timecodes of keys before the animation's own is known."""
 
 
 def check_controls(controls: AnimationControls) -> None:
@@ -26,7 +21,7 @@ def check_controls(controls: AnimationControls) -> None:
         read_factors(controls.expressiveness)
     for option, path, expected in (
         ("direction", keys_file(controls.direction), "keys over time, .json or .csv, or a mood such as calm"),
-        ("eyes", controls.eyes, ".json or .npz (see docs/animation_controls.md)"),
+        ("eyes", controls.eyes, ".json (see docs/animation_controls.md)"),
     ):
         if path is not None and not Path(path).exists():
             raise OptionError(option, f"no such file; expected {expected}", path)
@@ -72,21 +67,14 @@ def direction_for(direction: DirectionLike, recording: Path) -> DirectionLike:
     return file
 
 
-def keys_of(direction: DirectionLike | None, frame_rate: float | None = None) -> Direction | None:
-    """The keys over time; None if there are none, or each recording of a folder has its own.
-
-    Args:
-        direction: a file, a :class:`~facediff.editing.controls.direction.Direction`, or the rows of one.
-        frame_rate: of frames and timecodes, where the keys do not say it; not checked yet if None.
-    """
+def keys_of(direction: DirectionLike | None) -> Direction | None:
+    """The keys over time; None if there are none, or each recording of a folder has its own."""
     if direction is None:
         return None
     from facediff.editing.controls.direction import Direction, read_direction
 
     if isinstance(direction, str | Path):
-        if Path(direction).is_dir():
-            return None
-        return read_direction(direction, UNCHECKED if frame_rate is None else frame_rate)
+        return None if Path(direction).is_dir() else read_direction(direction)
     return direction if isinstance(direction, Direction) else Direction.parse(direction, "direction")
 
 

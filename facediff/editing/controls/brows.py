@@ -21,22 +21,10 @@ REGION = "brows"
 
 @dataclass(frozen=True, eq=False)
 class Brows:
-    """The brows of a face.
+    """Displacements of a face by its raised and by its lowered brows, of which the largest is one millimetre."""
 
-    Attributes:
-        up: displacements (V, 3) of which the largest is one millimetre, in the face's unit.
-        down: the same for lowered brows.
-    """
-
-    up: npt.NDArray[np.float32]
-    down: npt.NDArray[np.float32]
-
-    def moved(self, frame: npt.NDArray[np.float32], millimetres: float) -> npt.NDArray[np.float32]:
-        """A frame (V, 3) with brows raised by so much, or lowered where it is negative."""
-        if not millimetres:
-            return frame
-        field = self.up if millimetres > 0 else self.down
-        return frame + np.float32(abs(millimetres)) * field
+    up: npt.NDArray[np.float32]  # (V, 3) in the face's unit
+    down: npt.NDArray[np.float32]  # (V, 3)
 
 
 def brows_of(
@@ -57,14 +45,14 @@ def brows_of(
         return Brows(_one_millimetre(up, unit), _one_millimetre(-up, unit))
     from facediff.synthetic.known_faces import built_in_shapes, known_face
 
-    puppet = known_face(template, faces)
-    if puppet is None:
+    face = known_face(template, faces)
+    if face is None:
         neutral, triangles, _ = built_in_shapes("F1")
         lender = known_face(neutral, triangles)
         assert lender is not None  # noqa: S101 - for type checkers
         fields = carried("brows", neutral, triangles, np.stack([lender.brows_up, lender.brows_down]), template, faces)
     else:
-        fields = np.stack([puppet.brows_up, puppet.brows_down])
+        fields = np.stack([face.brows_up, face.brows_down])
     return Brows(*(_one_millimetre(field, unit) for field in fields))
 
 
@@ -107,8 +95,8 @@ def _one_millimetre(field: npt.ArrayLike, unit: str) -> npt.NDArray[np.float32]:
 
 
 def raise_brows(animation: Animation, brows: Brows, curve: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-    """Vertices (T, V, 3) with brows raised by millimetres (T,)."""
+    """Vertices (T, V, 3) with brows raised by millimetres (T,), or lowered where these are negative."""
     vertices = copied(animation.vertices)
     for index in np.flatnonzero(curve):
-        vertices[index] = brows.moved(vertices[index], float(curve[index]))
+        vertices[index] += np.float32(abs(curve[index])) * (brows.up if curve[index] > 0 else brows.down)
     return vertices

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.editing.controls import keys_of, procedural, refuse_folder
 from facediff.editing.controls.direction import METADATA, Direction, channel_of, curve, direction_of
-from facediff.editing.controls.expressiveness import expressiveness_words, scaled_regions
+from facediff.editing.controls.expressiveness import ALL, check_factors, read_factors, scaled_regions
 from facediff.editing.controls.eyelids import GIVE, Array, Eyes, eyes_for
-from facediff.editing.controls.procedural import EDITED, PROCEDURAL, Amount, with_metadata
+from facediff.editing.controls.procedural import EDITED, PROCEDURAL, SWAYS, Amount, in_words, with_metadata
 from facediff.errors import FaceDiffError, OptionError
 
 if TYPE_CHECKING:
@@ -35,27 +35,16 @@ ACTED = ("brows", "lids", *HEAD)
 
 @dataclass(frozen=True, eq=False)
 class Amounts:
-    """How much of everything there is in each frame of a stretch, with all that is random in it.
+    """How much of everything there is in each frame of a stretch, with all that is random in it."""
 
-    Attributes:
-        expressiveness: factors by region; empty if nothing is scaled.
-        shapes: weights (T,) by ARKit's names.
-        brows: millimetres (T,).
-        gaze: degrees to the face's left and upwards (T, 2).
-        lids: how far they are shut (T,).
-        turns: rotations of the head (T, 3), axis-angle in radians.
-        shifts: of the head (T, 3), in head heights.
-        notes: entries of the metadata and their words.
-    """
-
-    expressiveness: Mapping[str, Amount] = field(default_factory=dict)
-    shapes: Mapping[str, Array] = field(default_factory=dict)
-    brows: Array | None = None
-    gaze: Array | None = None
-    lids: Array | None = None
-    turns: Array | None = None
-    shifts: Array | None = None
-    notes: tuple[tuple[str, str], ...] = ()
+    expressiveness: Mapping[str, Amount] = field(default_factory=dict)  # factors by region
+    shapes: Mapping[str, Array] = field(default_factory=dict)  # weights (T,) by ARKit's names
+    brows: Array | None = None  # millimetres (T,)
+    gaze: Array | None = None  # degrees to the face's left and upwards (T, 2)
+    lids: Array | None = None  # how far they are shut (T,)
+    turns: Array | None = None  # rotations of the head (T, 3), axis-angle in radians
+    shifts: Array | None = None  # of the head (T, 3), in head heights
+    notes: tuple[tuple[str, str], ...] = ()  # entries of the metadata and their words
 
     def part(self, frames: slice) -> Amounts:
         """The amounts of some of the frames; the notes stay complete."""
@@ -93,17 +82,8 @@ class ControlledFace:
     ) -> None:
         self.controls, self.direction = controls, direction
         channels = {} if direction is None else direction.channels
-        self.factors: dict[str, float] = {}
-        if controls.expressiveness is not None:
-            from facediff.editing.controls.expressiveness import read_factors
-
-            self.factors = read_factors(controls.expressiveness)
-        keyed = (channel.partition(".")[2] or "all" for channel in self._keys("expressiveness"))
-        factors = [*self.factors, *keyed]
-        if factors:
-            from facediff.editing.controls.expressiveness import check_factors
-
-            check_factors(dict.fromkeys(factors, 1.0), regions, name)
+        self.factors = read_factors(controls.expressiveness)
+        check_factors([*self.factors, *self._parts("expressiveness").values()], regions, name)
         self.eyes = self._needed_eyes(template, faces)
         self.brows: Brows | None = None
         if controls.acting is not None or "brows" in channels:
@@ -112,24 +92,23 @@ class ControlledFace:
             self.brows = brows_of(template, faces, regions, unit, self.eyes)
 
         self.shapes: Fields = {}
-        if shapes := [channel.partition(".")[2] for channel in self._keys("shape")]:
+        if shapes := self._parts("shape"):
             from facediff.editing.controls.face_shapes import shapes_of
 
-            self.shapes = shapes_of(template, faces, unit, shapes)
+            self.shapes = shapes_of(template, faces, unit, list(shapes.values()))
 
-    def _keys(self, name: str) -> dict[str, object]:
-        return {} if self.direction is None else dict(self.direction.under(name))
+    def _parts(self, name: str) -> dict[str, str]:
+        """The keyed channels of a name, and what they name after the dot, ``all`` if nothing."""
+        channels = () if self.direction is None else self.direction.under(name)
+        return {channel: channel.partition(".")[2] or ALL for channel in channels}
 
     def _needed_eyes(self, template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None) -> Eyes | None:
         """The face's eyes, if anything needs them; some controls only work better where they are known."""
-        controls = self.controls
-        lids = (
-            "{blinks}" if controls.blinks is not None else next((n for n in ("blinks", "lids") if self._keys(n)), None)
-        )
-        balls = "{gaze}" if controls.gaze is not None else "gaze" if self._keys("gaze") else None
-        helped = controls.expressiveness is not None or controls.acting is not None
-        helped = helped or bool(self._keys("expressiveness") or self._keys("brows"))
+        controls, keyed = self.controls, {} if self.direction is None else self.direction.channels
+        lids = "{blinks}" if controls.blinks is not None else next((n for n in ("blinks", "lids") if n in keyed), None)
+        balls = "{gaze}" if controls.gaze is not None else "gaze" if "gaze" in keyed else None
         asking = lids or balls
+        helped = controls.acting is not None or "brows" in keyed or self.factors or self._parts("expressiveness")
         if asking is None and not helped:
             return None
         eyes = eyes_for(template, faces, None if controls.eyes is None else Path(controls.eyes))
@@ -146,7 +125,7 @@ class ControlledFace:
         """Refuse, for a stream, controls that depend on the end of the animation."""
         for name in ("blinks", "gaze", "sway"):
             source = "" if self.direction is None else f"{self.direction.source}: channel {name}"
-            if control := f"--{name}" if getattr(self.controls, name) is not None else self._keys(name) and source:
+            if control := f"--{name}" if getattr(self.controls, name) is not None else self._parts(name) and source:
                 raise FaceDiffError(
                     f"{control}: needs the whole animation; animate a recording, or give --acting, which needs none"
                 )
@@ -166,21 +145,18 @@ class ControlledFace:
         controls = self.controls
         seed = seed if controls.controls_seed is None else controls.controls_seed
         times = (start + np.arange(frames)) / frame_rate
-        curves = (
-            {}
-            if self.direction is None
-            else {
-                name: curve(keys, times, eased=True)
-                for name, keys in self.direction.channels.items()
-                if channel_of(name).range is not None
-            }
-        )
+        curves = {
+            name: curve(keys, times, eased=True)
+            for name, keys in ({} if self.direction is None else self.direction.channels).items()
+            if channel_of(name).range is not None
+        }
         notes: list[tuple[str, str]] = []
         factors: dict[str, Amount] = dict(self.factors)
-        factors |= {name.partition(".")[2] or "all": curves[name] for name in self._keys("expressiveness")}
+        factors |= {region: curves[name] for name, region in self._parts("expressiveness").items()}
         if factors:
-            notes.append((EDITED, expressiveness_words(factors)))
-        shapes = {name.partition(".")[2]: curves[name] for name in self._keys("shape")}
+            words = ", ".join(f"{name} {in_words(value)}" for name, value in factors.items())
+            notes.append((EDITED, f"expressiveness ({words})"))
+        shapes = {shape: curves[name] for name, shape in self._parts("shape").items()}
         if shapes:
             notes.append((EDITED, "shape keys"))
         poses: dict[str, Array] = {name: curves[name] for name in ACTED if name in curves}
@@ -195,21 +171,21 @@ class ControlledFace:
                 poses[name] = np.clip(poses[name] + values if name in poses else values, limits.least, limits.most)
         gaze, degrees = None, curves.get("gaze", controls.gaze)
         if degrees is not None and self.eyes is not None:
-            gaze = procedural.gaze_over_time(frames, frame_rate, degrees, seed)
-            notes.append((PROCEDURAL, procedural.gaze_words(degrees, seed)))
+            gaze = procedural.gaze_curve(frames, frame_rate, degrees=degrees, seed=seed)
+            notes.append((PROCEDURAL, f"gaze ({in_words(degrees)} degrees, seed {seed})"))
         lids, rate = poses.get("lids"), curves.get("blinks", controls.blinks)
         if rate is not None and self.eyes is not None and self.eyes.closing is not None:
             blinks = procedural.blinks_over_time(frames, frame_rate, rate, seed)
             lids = blinks if lids is None else np.maximum(lids, blinks)
-            notes.append((PROCEDURAL, procedural.blink_words(rate, seed)))
+            notes.append((PROCEDURAL, f"blinks ({in_words(rate)} a minute, seed {seed})"))
         turns, shifts, sway = None, np.zeros((frames, 3)), curves.get("sway", controls.sway)
         if any(name in poses for name in HEAD):
             turns = np.deg2rad(np.stack([poses.get(name, np.zeros(frames)) for name in HEAD], axis=1))
         if sway is not None:
-            swaying, shifts = procedural.sway_over_time(frames, frame_rate, sway, seed)
+            swaying, shifts = procedural.sway_curve(frames, frame_rate, degrees=sway, seed=seed)
             turns = swaying if turns is None else turns + swaying
-            notes.append((PROCEDURAL, procedural.sway_words(sway, seed)))
-        if self._keys("head"):
+            notes.append((PROCEDURAL, f"{SWAYS} ({in_words(sway)} degrees, seed {seed})"))
+        if self._parts("head"):
             notes.append((EDITED, "head keys"))
         if acting is not None:
             notes.append((PROCEDURAL, f"brow and head acting ({controls.acting}, seed {seed})"))
@@ -258,9 +234,7 @@ class ControlledFace:
         name, direction = METADATA, self.direction
         if METADATA in animation.metadata:
             before = direction_of(animation)
-            if before is None:  # of a file from elsewhere
-                return animation
-            if set(direction.keys) <= set(before.keys):
+            if before is None or set(direction.keys) <= set(before.keys):  # of a file from elsewhere, or there already
                 return animation
             if set(direction.channels) & set(before.channels):  # both have changed it, one after the other
                 name = f"{METADATA}, afterwards"
@@ -275,7 +249,7 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
     if controls.is_off:
         return animation
     refuse_folder(controls.direction)
-    direction = keys_of(controls.direction, animation.frame_rate)
+    direction = keys_of(controls.direction)
     if direction is not None:
         direction.refuse_model_channels()
         before = direction_of(animation)
@@ -288,21 +262,13 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
             raise FaceDiffError(
                 f"{direction.source}: {animation.name} has {repeated[0]} already; give the animation as it was before"
             )
-    gestures = None
+    seed, gestures = seed if controls.controls_seed is None else controls.controls_seed, None
     if controls.acting is not None:
         from facediff.editing.acting import act, read_acting
 
-        gestures = act(
-            read_acting(controls.acting), animation, seed if controls.controls_seed is None else controls.controls_seed
-        )
+        gestures = act(read_acting(controls.acting), animation, seed)
     face = ControlledFace(
-        controls,
-        direction,
-        animation.template,
-        animation.faces,
-        animation.regions,
-        animation.unit,
-        animation.name,
+        *(controls, direction, animation.template, animation.faces, animation.regions, animation.unit, animation.name)
     )
     amounts = face.amounts(len(animation.vertices), animation.frame_rate, seed=seed, acting=gestures)
     return face.apply(animation, amounts)

@@ -6,8 +6,6 @@ docs/animation_controls.md describes; and the curves between keys.
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +20,7 @@ from facediff.errors import FaceDiffError, choices, damaged
 from facediff.spaces.arkit import ARKIT, LEFT_AND_RIGHT
 from facediff.utils import ranges
 from facediff.utils.hints import Range, check_number, shown
-from facediff.utils.limits import FRAME_RATES, check_format, quoted
+from facediff.utils.limits import check_format, quoted
 from facediff.utils.paths import find_file, from_home
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_columns, write_json, write_rows
 from facediff.utils.records import read_record
@@ -45,8 +43,7 @@ SLOPES = Range(-1e6, 1e6)
 MOST_KEYS = 100_000
 INSTEAD_OF = ("acting", "blinks")
 """Options that keys can replace: a page turns their motion into keys."""
-COLUMNS = ("time", "frame", "channel", "value", "interpolation", "slope")
-_TIMECODE = re.compile(r"([0-9]{1,2}):([0-9]{2}):([0-9]{2})([:;.,])([0-9]{1,3})", re.ASCII)
+COLUMNS = ("time", "channel", "value", "interpolation", "slope")
 
 
 @dataclass(frozen=True)
@@ -210,13 +207,10 @@ class Direction:
         """Refuse channels of the model, such as the style, for a finished animation or an exported model."""
         channel = next((name for name in self.channels if channel_of(name).in_model), None)
         if channel is not None:
-            reason = (
-                "needs a checkpoint (.ckpt of a training), and this model is an exported one; leave these keys out, or "
-                "give the checkpoint"
-                if exported
-                else "needs the model, and the animation is finished; give the keys to `facediff animate --direction`"
-            )
-            raise FaceDiffError(f"{self.source}: channel {channel}: {reason}")
+            reason = "the animation is finished; give the keys to `facediff animate --direction`"
+            if exported:
+                reason = "this one is exported; leave these keys out, or give the checkpoint (.ckpt of a training)"
+            raise FaceDiffError(f"{self.source}: channel {channel}: needs the model itself, and {reason}")
 
     def without_model_channels(self) -> Direction | None:
         """The keys of channels that change finished motion; None if there are none."""
@@ -225,16 +219,7 @@ class Direction:
 
     def rows(self) -> list[dict[str, float | str]]:
         """The keys as the rows of a file."""
-        return [
-            {
-                "time": key.time,
-                "channel": key.channel,
-                "value": key.value,
-                "interpolation": key.interpolation,
-                **({} if key.slope is None else {"slope": key.slope}),
-            }
-            for key in self.keys
-        ]
+        return [{name: value for name, value in vars(key).items() if value is not None} for key in self.keys]
 
     def _content(self) -> dict[str, object]:
         """The content of a JSON file."""
@@ -259,21 +244,15 @@ class Direction:
         return path
 
     @classmethod
-    def parse(cls, content: object, source: str, frame_rate: float | None = None) -> Direction:
-        """A direction from the content of a JSON file, or from its list of keys.
-
-        Args:
-            content: the object, a list of rows, or the text of either.
-            source: its name in messages.
-            frame_rate: of frames and timecodes, where the content states none.
-        """
+    def parse(cls, content: object, source: str) -> Direction:
+        """A direction from the content of a JSON file, from its list of keys, or from the text of either."""
         if isinstance(content, str):
             content = parse_json(content, source)
         if isinstance(content, list):
             content = {"keys": content}
         record = read_record(_Content, content, source, remedy="give keys over time, .json or .csv")
         check_format(source, f"{record.format} {record.version}", f"{FORMAT} {VERSION}")
-        keys = tuple(_read_keys(enumerate(record.keys, 1), source, record.frame_rate or frame_rate))
+        keys = tuple(_read_keys(enumerate(record.keys, 1), source))
         return cls(keys, source, record.instead_of)
 
 
@@ -284,18 +263,16 @@ class _Content:
     keys: tuple[Any, ...]
     format: str = FORMAT
     version: int = VERSION
-    frame_rate: ranges.FrameRate | None = None
     instead_of: tuple[Literal["acting", "blinks"], ...] = ()
 
 
 @dataclass(frozen=True)
 class _Row:
-    """A key in a file; tables hold numbers as texts."""
+    """A key in a file."""
 
+    time: Any
     channel: str
     value: Any
-    time: Any = None
-    frame: Any = None
     interpolation: Interpolation = "smooth"
     slope: Any = None
 
@@ -338,31 +315,26 @@ def is_mood(path: str | Path) -> bool:
     return str(path) in MOODS and not Path(path).exists()
 
 
-def read_direction(path: str | Path, frame_rate: float | None = None) -> Direction:
-    """A direction from a file.
-
-    Args:
-        path: .json or .csv, an animation (.npz) that was made with a direction, or the name of a mood.
-        frame_rate: of frames and timecodes, where the file states none.
-    """
+def read_direction(path: str | Path) -> Direction:
+    """A direction from a .json or .csv, from an animation (.npz) that was made with one, or by the name of a mood."""
     if is_mood(path):
         return Direction(MOODS[str(path)], str(path))
     path = Path(from_home(path))
     suffix = path.suffix.lower()
     if suffix == ".csv":
-        return Direction(tuple(_read_keys(_csv_rows(path), str(path), frame_rate)), str(path))
+        return Direction(tuple(_read_keys(_csv_rows(path), str(path))), str(path))
     if suffix == ".npz":
         from facediff.animation import read_archive
 
-        return Direction.parse(read_archive(path).metadata.get(METADATA), str(path), frame_rate)
+        return Direction.parse(read_archive(path).metadata.get(METADATA), str(path))
     content = load_json(path, remedy=f"expected keys over time, .json or .csv, or {', '.join(MOODS)}")
-    return Direction.parse(content, str(path), frame_rate)
+    return Direction.parse(content, str(path))
 
 
 def direction_of(animation: Animation) -> Direction | None:
     """The keys that an animation was made with; None without any, or if its metadata hold something else."""
     try:
-        return Direction.parse(animation.metadata.get(METADATA), animation.name, animation.frame_rate)
+        return Direction.parse(animation.metadata.get(METADATA), animation.name)
     except FaceDiffError:
         return None
 
@@ -377,10 +349,10 @@ def direction_file(folder: Path, recording: Path) -> Path | None:
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of a table with their numbers as a spreadsheet counts them; empty cells are left out."""
-    remedy = "expected a table with the columns time (or frame), channel, value and interpolation"
+    """Rows of a table as a spreadsheet counts them; empty cells are left out."""
+    remedy = "expected a table with the columns time, channel, value and interpolation"
     header, rows = read_columns(path, COLUMNS, remedy=remedy)
-    if not {"channel", "value"} <= set(header) <= set(COLUMNS):
+    if not {"time", "channel", "value"} <= set(header) <= set(COLUMNS):
         raise FaceDiffError(f"{path}: row 1: has the columns {quoted(header)}; {remedy}")
     for number, row in enumerate(rows, 2):
         # A cell beyond the header gets an empty name, which is refused as an unknown field.
@@ -389,44 +361,20 @@ def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
             yield number, cells
 
 
-def _read_keys(rows: Iterable[tuple[int, object]], source: str, frame_rate: float | None) -> Iterator[Key]:
-    """Keys of rows with their numbers; texts that stand for numbers are read."""
+def _read_keys(rows: Iterable[tuple[int, object]], source: str) -> Iterator[Key]:
+    """Keys of rows with their numbers; texts that stand for numbers are read, since tables hold texts."""
     for number, row in rows:
         location = f"{source}: row {number}"
         with damaged(location, f"expected {', '.join(COLUMNS)}"):
-            key = _read_key(read_record(_Row, row, location), location, frame_rate)
+            cells = vars(read_record(_Row, row, location))
+            limits = channel_of(cells["channel"]).range
+            if limits is None and cells["slope"] is not None:
+                raise FaceDiffError(f"{location}: slope: expected none, since the channel takes texts")
+            for name, bounds in (("time", TIMES), ("value", limits), ("slope", SLOPES)):
+                if bounds is not None and (name, cells[name]) != ("slope", None):
+                    cells[name] = check_number(location, name, cells[name], bounds.least, bounds.most, text=True)
+            key = Key(**cells)
         yield key
-
-
-def _read_key(row: _Row, source: str, frame_rate: float | None) -> Key:
-    limits = channel_of(row.channel).range
-    if (row.time is None) == (row.frame is None) or (limits is None and row.slope is not None):
-        raise FaceDiffError(f"{source}: expected either a time or a frame, and a slope of numbers alone")
-
-    def number(name: str, value: object, limits: Range, remedy: str = "") -> float:
-        return check_number(source, name, value, limits.least, limits.most, text=True, remedy=remedy)
-
-    def seconds(name: str, frame: object) -> float:
-        if frame_rate is None:
-            raise FaceDiffError(f'{source}: {name} counts frames; state how many there are a second, "frame_rate"')
-        return number(name, frame, Range(0, TIMES.most * FRAME_RATES[1])) / frame_rate
-
-    if row.frame is not None:
-        time = seconds("frame", row.frame)
-    elif isinstance(row.time, str) and (timecode := _TIMECODE.fullmatch(row.time)):
-        # ``00:00:01:12`` (frames), or ``00:00:01.480``.
-        hours, minutes, whole_seconds, rest = (int(timecode[group]) for group in (1, 2, 3, 5))
-        if timecode[4] in ".,":
-            fraction = rest / 10 ** len(timecode[5])
-        else:
-            last = math.inf if frame_rate is None else math.ceil(frame_rate) - 1
-            fraction = seconds("time", number(f"time {row.time}: the frame", rest, Range(0, last)))
-        time = 3600 * hours + 60 * minutes + whole_seconds + fraction
-    else:
-        time = number("time", row.time, TIMES, "or a timecode such as 00:00:01:12")
-    value = row.value if limits is None else number("value", row.value, limits)
-    slope = None if row.slope is None else number("slope", row.slope, SLOPES)
-    return Key(time, row.channel, value, row.interpolation, slope)
 
 
 # Curves.
@@ -436,9 +384,8 @@ def curve(keys: Sequence[Key], times: npt.ArrayLike, *, eased: bool = False) -> 
     """Numbers (T,) of a channel's keys, in their order, at times (T,) in seconds.
 
     ``step`` keeps a key's value until the next key. ``linear`` goes there on a line. ``smooth`` is the cubic Hermite
-    curve between the values v₀, v₁ and the slopes s₀, s₁ at both keys: with t from 0 to 1 over d seconds,
-    (2t³ − 3t² + 1) v₀ + (t³ − 2t² + t) d s₀ + (3t² − 2t³) v₁ + (t³ − t²) d s₁. :func:`slopes` computes the slopes
-    that are not given.
+    curve between the values v₀, v₁ and the :func:`slopes` s₀, s₁ at both keys: with t from 0 to 1 over d seconds,
+    (2t³ − 3t² + 1) v₀ + (t³ − 2t² + t) d s₀ + (3t² − 2t³) v₁ + (t³ − t²) d s₁.
 
     Args:
         keys: of one channel of numbers.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -12,8 +12,7 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.animation import allocate_like
 from facediff.animation.options import Scales, scales_text
-from facediff.editing.controls.eyelids import Array, Eyes, Indices
-from facediff.editing.controls.procedural import in_words
+from facediff.editing.controls.eyelids import Array, Eyes
 from facediff.errors import OptionError, check_known
 from facediff.utils.hints import Range, read
 from facediff.utils.numerics import nearest_distances, smooth_step
@@ -26,11 +25,6 @@ HIGHEST = 4.0  # Motion more than this many times as large does not look like a 
 
 def read_factors(scales: Scales | None, option: str = "expressiveness", highest: float = HIGHEST) -> dict[str, float]:
     """Factors by region: ``1.2`` (all), or ``upper_face=1.5,lips=0.9``; empty for None.
-
-    Args:
-        scales: a number, a mapping, or text as the command line takes it.
-        option: the option's name, for errors.
-        highest: the largest factor.
 
     Example:
         >>> read_factors("upper_face=1.5,all=1.1")
@@ -57,14 +51,9 @@ def read_factors(scales: Scales | None, option: str = "expressiveness", highest:
     return factors
 
 
-def check_factors(factors: Mapping[str, float], regions: Mapping[str, object], name: str) -> None:
+def check_factors(factors: Iterable[str], regions: Mapping[str, object], name: str) -> None:
     """Refuse a region that the face called ``name`` does not have."""
     check_known(name, "region", factors, [*regions, ALL])
-
-
-def expressiveness_words(factors: Mapping[str, float | npt.NDArray[np.floating]]) -> str:
-    """Expressiveness in the metadata."""
-    return f"expressiveness ({', '.join(f'{name} {in_words(value)}' for name, value in factors.items())})"
 
 
 def scaled_regions(
@@ -79,10 +68,7 @@ def scaled_regions(
             do not run through each other.
     """
     weights = region_weights(animation.template, animation.regions, list(factors), animation.name)
-    lids: Indices = np.zeros(0, np.int64)
-    closing = None
-    if eyes is not None and eyes.closing is not None:
-        lids, closing = eyes.lids()
+    lids, closing = (np.zeros(0, np.int64), None) if eyes is None or eyes.closing is None else eyes.lids()
     vertices = allocate_like(animation.vertices)
     count = len(animation.vertices)
     in_frames = {name: np.broadcast_to(np.asarray(value, np.float64), count) for name, value in factors.items()}
@@ -104,17 +90,11 @@ def scaled_regions(
 
 @dataclass(frozen=True, eq=False)
 class RegionWeights:
-    """How much each region counts at each vertex.
+    """How much each region counts at each vertex."""
 
-    Attributes:
-        names: the regions but for ``all``.
-        weights: (regions, V), between 0 and 1.
-        rest: (V,) the remainder, for ``all``.
-    """
-
-    names: tuple[str, ...]
-    weights: Array
-    rest: Array
+    names: tuple[str, ...]  # the regions but for ``all``
+    weights: Array  # (regions, V), between 0 and 1
+    rest: Array  # (V,) the remainder, for ``all``
 
     def factors(self, factors: Mapping[str, float]) -> Array:
         """The factor of every vertex (V,), from factors of the regions and ``all`` (1 if absent)."""
@@ -142,7 +122,7 @@ def region_factors(
         regions: vertex indices by name.
         factors: by region, or ``all`` (1 if absent).
         name: of the face, for the message.
-        fall_off: in the template's unit; 0.06 of the face's size if None.
+        fall_off: in the template's unit; :data:`FALL_OFF` of the face's size if None.
     """
     return region_weights(template, regions, list(factors), name, fall_off).factors(factors)
 
@@ -155,7 +135,7 @@ def region_weights(
     fall_off: float | None = None,
 ) -> RegionWeights:
     """The weights of regions at every vertex; arguments as in :func:`region_factors`."""
-    check_factors(dict.fromkeys(names, 1.0), regions, name)
+    check_factors(names, regions, name)
     points = np.asarray(template, np.float64)
     width = FALL_OFF * float(np.linalg.norm(np.ptp(points, axis=0))) if fall_off is None else fall_off
     region_names = tuple(region for region in names if region != ALL)

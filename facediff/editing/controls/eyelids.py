@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import OptionError, damaged
-from facediff.utils.arrays import open_array, read_arrays
+from facediff.utils.arrays import open_array
 from facediff.utils.numerics import smooth_step
 from facediff.utils.plain_files import load_json
 from facediff.utils.records import read_record
@@ -74,65 +74,44 @@ def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Ey
 def read_eyes(path: Path, template: Vertices) -> Eyes:
     """The eyes of a face (V, 3) from a file.
 
-    ``.json`` names shapes of shut eyes or lists the lids' edges, and lists the eyeballs::
+    It names shapes of shut eyes or lists the lids' edges, and lists the eyeballs::
 
         {"neutral": "neutral.obj", "blinks": ["eyeBlinkLeft.obj", "eyeBlinkRight.obj"],
          "eyeballs": ["FLAME_masks.pkl:left_eyeball", "FLAME_masks.pkl:right_eyeball"],
          "brows": ["brows.txt"]}
-
-    ``.npz`` holds the same as arrays: ``closing`` (V, 3), ``neutral`` (V, 3), and ``brows`` and any ``eyeball…`` with
-    indices.
     """
-    if path.suffix.lower() == ".npz":
-        arrays = read_arrays(path, name=f"eyes {path}")
-        names = sorted(name for name in arrays if name.startswith("eyeball"))
-        balls = tuple(_checked(path, arrays[name], len(template), 4) for name in names)
-        closing, neutral = arrays.get("closing"), arrays.get("neutral")
-        brows = _checked(path, arrays["brows"], len(template)) if "brows" in arrays else None
-    else:
-        closing, neutral, balls, brows = _read_json(path, template)
-    if closing is None and not balls and brows is None:
+    record, count = read_record(_EyesFile, load_json(path, name=f"eyes {path}"), f"eyes {path}"), len(template)
+    balls = tuple(_indices(path, entry, count, 4) for entry in record.eyeballs)
+    brows = None
+    if record.brows:
+        entries = record.brows if any(isinstance(entry, str | list) for entry in record.brows) else [list(record.brows)]
+        brows = np.unique(np.concatenate([_indices(path, entry, count) for entry in entries]))
+    size, closing = float(np.linalg.norm(np.ptp(template, axis=0))), np.zeros((1, 3))
+    if record.blinks:
+        neutral = _read_shape(path, record.neutral) if record.neutral else None
+        with damaged(f"eyes {path}", 'give shapes of this face, and the open face of the same mesh as "neutral"'):
+            for name in record.blinks:
+                shape = _read_shape(path, name)
+                closing = closing + (shape if Path(name).suffix.lower() == ".npy" else np.subtract(shape, neutral))  # type: ignore[arg-type]
+        if neutral is not None:
+            closing *= size / max(float(np.linalg.norm(np.ptp(neutral, axis=0))), 1e-12)
+    elif record.lids:
+        edges = [(_indices(path, lid.upper, count, 2), _indices(path, lid.lower, count, 2)) for lid in record.lids]
+        closing = closing_of_lids(template, edges, np.concatenate(balls) if balls else None)
+    elif not balls and brows is None:
         raise OptionError.naming(
             f"{{eyes}} {path}: says nothing of lids or eyeballs, nor of brows; known are {', '.join(KEYS)}"
         )
-    if closing is None:
+    else:
         return Eyes(None, balls, f"eyes {path}", brows)
-    size = float(np.linalg.norm(np.ptp(template, axis=0)))
-    scale = 1.0 if neutral is None else size / max(float(np.linalg.norm(np.ptp(neutral, axis=0))), 1e-12)
-    longest = scale * float(np.linalg.norm(closing, axis=-1).max())
-    same_mesh = closing.shape == template.shape and (neutral is None or neutral.shape == template.shape)
-    if not same_mesh or not PLAUSIBLE[0] * size < longest < PLAUSIBLE[1] * size:
+    longest = float(np.linalg.norm(closing, axis=-1).max())
+    if closing.shape != template.shape or not PLAUSIBLE[0] * size < longest < PLAUSIBLE[1] * size:
         raise OptionError.naming(
             f"{{eyes}} {path}: its blink has shape {closing.shape} and moves a lid by {longest:.3g}, on a face of "
             f'shape {template.shape} and size {size:.3g}; give the shape of shut eyes, and as "neutral" the open face '
             f"in the same unit"
         )
-    return Eyes(np.asarray(scale * closing, np.float32), balls, f"eyes {path}", brows)
-
-
-def _read_json(
-    path: Path, template: Vertices
-) -> tuple[Vertices | None, Vertices | None, tuple[Indices, ...], Indices | None]:
-    """Closing of the lids by shapes or edges; the open face; eyeballs; brows. None where the file states none."""
-    record = read_record(_EyesFile, load_json(path, name=f"eyes {path}"), f"eyes {path}")
-    count = len(template)
-    balls = tuple(_indices(path, entry, count, 4) for entry in record.eyeballs)
-    neutral = _read_shape(path, record.neutral) if record.neutral else None
-    brows = None
-    if record.brows:
-        entries = record.brows if any(isinstance(entry, str | list) for entry in record.brows) else [list(record.brows)]
-        brows = np.unique(np.concatenate([_indices(path, entry, count) for entry in entries]))
-    if record.blinks:
-        total: Vertices = np.zeros((count, 3))
-        with damaged(f"eyes {path}", 'give shapes of this face, and the open face of the same mesh as "neutral"'):
-            for name in record.blinks:
-                shape = _read_shape(path, name)
-                total = total + (shape if Path(name).suffix.lower() == ".npy" else np.subtract(shape, neutral))  # type: ignore[arg-type]
-        return total, neutral, balls, brows
-    if record.lids:
-        edges = [(_indices(path, lid.upper, count, 2), _indices(path, lid.lower, count, 2)) for lid in record.lids]
-        return closing_of_lids(template, edges, np.concatenate(balls) if balls else None), neutral, balls, brows
-    return None, neutral, balls, brows
+    return Eyes(np.asarray(closing, np.float32), balls, f"eyes {path}", brows)
 
 
 @dataclass(frozen=True)
@@ -169,14 +148,10 @@ def _indices(path: Path, entry: object, n_vertices: int, least: int = 1) -> Indi
     from facediff.metrics.regions import read_indices
 
     with damaged(f"eyes {path}", "expected lists of vertex indices"):
-        if not isinstance(entry, str):
-            return _checked(path, np.asarray(entry), n_vertices, least)
-        file, _, mask = entry.partition(":") if ".pkl:" in entry else (entry, "", "")
-        indices = read_masks(path.parent / file, mask) if file.endswith(".pkl") else read_indices(path.parent / file)
-        return _checked(path, np.asarray(indices), n_vertices, least)
-
-
-def _checked(path: Path, indices: npt.NDArray[Any], n_vertices: int, least: int = 1) -> Indices:
+        if isinstance(entry, str):
+            file, _, mask = entry.partition(":") if ".pkl:" in entry else (entry, "", "")
+            entry = read_masks(path.parent / file, mask) if file.endswith(".pkl") else read_indices(path.parent / file)
+        indices = np.asarray(entry)
     is_list = indices.ndim == 1 and len(indices) >= least and np.issubdtype(indices.dtype, np.integer)
     if not is_list or not 0 <= indices.min() <= indices.max() < n_vertices:
         raise OptionError.naming(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,13 +24,8 @@ MOVED_HEAD = (SWAYS, "head keys", "head acting")
 Amount = float | npt.NDArray[np.floating]
 """A number, or one for each frame (T,)."""
 
-Layer = Literal["blinks", "gaze", "sway", "kept blinks"]
-STREAMS: dict[Layer, int] = {"blinks": 1, "gaze": 2, "sway": 3, "kept blinks": 5}
-
-
-def random_of(layer: Layer, seed: int) -> np.random.Generator:
-    """Random numbers of a layer: adding or omitting another layer does not change them."""
-    return np.random.default_rng([seed, STREAMS[layer]])
+# Streams of random numbers of a seed: adding or omitting another layer does not change a layer's.
+BLINKS, GAZE, SWAY, KEEPS_BLINK = 1, 2, 3, 5
 
 
 # Blinks. How often people blink is from Bentivoglio et al., "Analysis of blink rate patterns in normal subjects",
@@ -45,11 +39,6 @@ GAP = 0.15  # Seconds from one blink's end to the next one's start at least
 DOUBLE = 0.12  # Share of blinks that another one follows immediately
 WIDENED = -0.5
 """How far an eye may be open beyond the neutral face, as a share of a closing, so that a blink still shuts it."""
-
-
-def blink_words(rate: Amount, seed: int) -> str:
-    """Blinks in the metadata."""
-    return f"blinks ({in_words(rate)} a minute, seed {seed})"
 
 
 def shut_lids(animation: Animation, eyes: Eyes, curve: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
@@ -90,7 +79,7 @@ def blink_curve(
     seed: int = 0,
     chances: npt.NDArray[np.floating] | None = None,
 ) -> Array:
-    """How far the eyes are shut in every frame (T,), 0 to 1.
+    """How far the eyes are shut in every frame (T,), 0 to 1, at a number of blinks a minute.
 
     Intervals are a gamma distribution of shape 2 above the shortest possible one, with the mean that the rate asks for.
     No two blinks overlap, none begins before the first frame or ends after the last, each is fully shut for a frame.
@@ -101,12 +90,8 @@ def blink_curve(
         rate: blinks a minute.
         seed: of the random numbers.
         chances: probability (T,) of keeping a blink that begins in a frame; all are kept if None.
-
-    Example:
-        >>> bool((blink_curve(250, 25.0, seed=1) == 1.0).any())
-        True
     """
-    random, chance = random_of("blinks", seed), random_of("kept blinks", seed)
+    random, chance = (np.random.default_rng([seed, stream]) for stream in (BLINKS, KEEPS_BLINK))
     times = np.arange(frames) / frame_rate
     last = times[-1] if frames else 0.0
     hold = max(SHUT, 1.0 / frame_rate)  # so that one frame at least falls into it
@@ -143,17 +128,6 @@ LIDS_PER_DEGREE = 0.012
 """How far the lids close with each degree that the eyes look down, as a share of a full closing (up: they open)."""
 
 
-def gaze_words(degrees: Amount, seed: int) -> str:
-    """Gaze in the metadata."""
-    return f"gaze ({in_words(degrees)} degrees, seed {seed})"
-
-
-def gaze_over_time(frames: int, frame_rate: float, degrees: Amount, seed: int) -> Array:
-    """Where the eyes look in every frame (T, 2) at a largest angle that may change from frame to frame."""
-    largest, share = largest_of(degrees)
-    return np.asarray(share * gaze_curve(frames, frame_rate, degrees=largest, seed=seed))
-
-
 def turn_eyes(animation: Animation, eyes: Eyes, angles: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
     """Vertices (T, V, 3) with eyeballs that are turned by angles (T, 2), and lids that follow them."""
     turns = gaze_rotations(angles)
@@ -175,21 +149,20 @@ def turn_eyes(animation: Animation, eyes: Eyes, angles: npt.NDArray[np.floating]
     return vertices
 
 
-@ranges.checked
-def gaze_curve(frames: int, frame_rate: float, *, degrees: ranges.GazeAngle = DEGREES_GAZE, seed: int = 0) -> Array:
-    """Where the eyes look in every frame, (T, 2): degrees to the face's left and upwards.
+def gaze_curve(frames: int, frame_rate: float, *, degrees: Amount = DEGREES_GAZE, seed: int = 0) -> Array:
+    """Where the eyes look in every frame, (T, 2): degrees to the face's left and upwards, up to a largest angle.
 
     Fixations straight ahead and elsewhere alternate, now and then with two elsewhere; the first and the last are
     straight ahead.
     """
-    random = random_of("gaze", seed)
+    random, (largest, share) = np.random.default_rng([seed, GAZE]), largest_of(degrees)
 
     def fixation(mean: float) -> float:
         return SHORTEST + float(random.gamma(2.0, (mean - SHORTEST) / 2.0))
 
     def somewhere() -> Array:
-        # Small turns are commoner than large ones; none is farther than `degrees`.
-        size = degrees * min(1.0, 0.25 + float(random.exponential(0.35)))
+        # Small turns are commoner than large ones.
+        size = largest * min(1.0, 0.25 + float(random.exponential(0.35)))
         direction = random.uniform(0.0, 2.0 * np.pi)
         return np.array([size * np.cos(direction), UPWARDS * size * np.sin(direction)])
 
@@ -207,7 +180,7 @@ def gaze_curve(frames: int, frame_rate: float, *, degrees: ranges.GazeAngle = DE
         first = int(time * frame_rate)
         curve[first:] = gaze + smooth_step((times[first:] - time) / seconds)[:, None] * (goal - gaze)
         gaze, time = goal, time + seconds + stay
-    return curve
+    return np.asarray(share * curve)
 
 
 def gaze_rotations(angles: npt.NDArray[np.floating]) -> Array:
@@ -238,18 +211,6 @@ SHIFT = 0.004  # Largest shift for each degree of rotation, as a share of the he
 AT_REST = 1.0  # Seconds over which the sway begins and ends
 
 
-def sway_words(degrees: Amount, seed: int) -> str:
-    """Sway in the metadata."""
-    return f"{SWAYS} ({in_words(degrees)} degrees, seed {seed})"
-
-
-def sway_over_time(frames: int, frame_rate: float, degrees: Amount, seed: int) -> tuple[Array, Array]:
-    """Rotations and shifts (T, 3) of a sway; the largest rotation may change from frame to frame."""
-    largest, share = largest_of(degrees)
-    turns, shifts = sway_curve(frames, frame_rate, degrees=largest, seed=seed)
-    return share * turns, share * shifts
-
-
 def move_head(animation: Animation, turns: Array, shifts: Array) -> Animation:
     """The animation with vertices that move as one.
 
@@ -277,15 +238,12 @@ def neck(template: npt.NDArray[np.floating]) -> Array:
     return np.array([0.5 * (low[0] + high[0]), low[1] + 0.15 * height, high[2] - 0.6 * height])
 
 
-@ranges.checked
-def sway_curve(
-    frames: int, frame_rate: float, *, degrees: ranges.SwayAngle = DEGREES_SWAY, seed: int = 0
-) -> tuple[Array, Array]:
+def sway_curve(frames: int, frame_rate: float, *, degrees: Amount = DEGREES_SWAY, seed: int = 0) -> tuple[Array, Array]:
     """Rotations (T, 3), axis-angle in radians, and shifts (T, 3), in head heights; zero in the first and last frame.
 
     Sums of six sines between 0.08 and 0.6 Hz, so that nothing is quick; the largest rotation is ``degrees``.
     """
-    random = random_of("sway", seed)
+    random, (largest, share) = np.random.default_rng([seed, SWAY]), largest_of(degrees)
     times = np.arange(frames) / frame_rate
     last = float(times[-1]) if frames else 0.0
     # The waves begin anywhere; the ramps bring them from rest and back to it.
@@ -294,14 +252,13 @@ def sway_curve(
     rates = random.uniform(*BAND, (6, WAVES))
     phases = random.uniform(0.0, 2.0 * np.pi, (6, WAVES))
     waves = np.sin(2.0 * np.pi * rates * times[:, None, None] + phases).sum(axis=-1) * rest[:, None]
-    turns, shifts = waves[:, :3] * AXES, waves[:, 3:]
-    return _largest(turns, np.deg2rad(degrees)), _largest(shifts, SHIFT * degrees)
 
+    def scaled(vectors: Array, size: float) -> Array:
+        """Vectors (T, 3) of which the longest one is as long as a size."""
+        longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+        return share * (vectors * (size / longest) if longest > 0 else vectors)
 
-def _largest(vectors: Array, size: float) -> Array:
-    """Vectors (T, 3) scaled so that the longest one is as long as ``size``."""
-    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
-    return vectors * (size / longest) if longest > 0 else vectors
+    return scaled(waves[:, :3] * AXES, np.deg2rad(largest)), scaled(waves[:, 3:], SHIFT * largest)
 
 
 # Shared by all changes of an animation: arrays that may be too large for memory, and a note in the metadata.
@@ -324,12 +281,7 @@ def largest_of(amount: Amount) -> tuple[float, float | Array]:
 
 
 def in_words(amount: Amount) -> str:
-    """An amount in the metadata.
-
-    Example:
-        >>> in_words(2.5), in_words(np.array([1.0, 3.0])), in_words(np.array([2.0, 2.0]))
-        ('2.5', '1 to 3', '2')
-    """
+    """An amount in the metadata, such as ``2.5`` or ``1 to 3``."""
     low, high = np.min(amount), np.max(amount)
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 

@@ -159,7 +159,7 @@ def _page_facts(animations: Sequence[Animation], truth: int | None, blobs: Blobs
         "truth": truth,
         "heat": heat,
         "archive": ARCHIVE,
-        "direction": {**_direction_facts(), "frameRate": animations[0].frame_rate},
+        "direction": _direction_facts(),
         "animations": [
             _animation_facts(animation, number in compared, blobs) for number, animation in enumerate(animations)
         ],

@@ -24,7 +24,7 @@ FIELD_STEP = 0.01
 """Quantisation of displacements in mm: a vertex is off by less than 0.01 mm at a weight of 1."""
 ACTING = re.compile(r"brow and head acting \((.+), seed ([0-9]+)\)")
 BLINKS = re.compile(r"blinks \(([0-9.]+) a minute, seed ([0-9]+)\)")
-"""How the controls name them in metadata, such as :func:`~facediff.editing.controls.procedural.blink_words`."""
+"""How :meth:`~facediff.editing.controls.controlled_face.ControlledFace.amounts` names them in metadata."""
 
 
 def pose_fields(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:

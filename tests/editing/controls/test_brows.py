@@ -43,10 +43,6 @@ def test_a_file_says_where_they_are(make_animation: Callable[..., Animation], tm
     moved = made.vertices[0] - animation.vertices[0]
     np.testing.assert_allclose(moved[named], np.tile([0, 0.003, 0], (20, 1)), atol=1e-6)
     assert not moved[animation.regions["lips"]].any()
-    arrays = tmp_path / "eyes.npz"
-    np.savez(arrays, brows=np.array(named))
-    again = apply_controls(animation, AnimationControls(direction=keys, eyes=arrays))
-    np.testing.assert_array_equal(again.vertices, made.vertices)
 
 
 def test_a_mesh_without_a_face_is_asked_for_them() -> None:

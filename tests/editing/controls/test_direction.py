@@ -109,15 +109,11 @@ def test_files_come_back_as_they_were(tmp_path: Path, suffix: str) -> None:
     assert Direction.parse(made.text(), "text").keys == made.keys
 
 
-def test_frames_and_timecodes_are_seconds(tmp_path: Path) -> None:
-    path = tmp_path / "keys.csv"
-    path.write_text("Frame,time,channel,value\n50,,sway,1\n,00:01:02:12,sway,2\n,00:00:03.480,gaze,3\n\n")
-    assert [key.time for key in read_direction(path, 25.0).keys] == [2.0, 3.48, 62.48]
-    path.write_text(path.read_text().replace(",", ";"))  # as spreadsheets of countries with a decimal comma write it
+def test_a_table_with_semicolons_is_refused(tmp_path: Path) -> None:
+    """As spreadsheets of countries with a decimal comma write it."""
+    (tmp_path / "keys.csv").write_text("Time;channel;value\n1;sway;1\n")
     with pytest.raises(FaceDiffError, match="semicolons between its columns"):
-        read_direction(path, 25.0)
-    content = {"frame_rate": 24, "keys": [{"frame": 36, "channel": "sway", "value": 1}]}
-    assert Direction.parse(content, "keys", 25.0).keys[0].time == 1.5
+        read_direction(tmp_path / "keys.csv")
 
 
 @pytest.mark.parametrize(
@@ -135,10 +131,8 @@ def test_frames_and_timecodes_are_seconds(tmp_path: Path) -> None:
         ({"time": 0, "channel": "style", "value": 3}, "value"),
         ({"time": -1, "channel": LARGER, "value": 1}, "time"),
         ({"time": "1:2", "channel": LARGER, "value": 1}, "time"),
-        ({"time": "00:00:01:25", "channel": LARGER, "value": 1}, "time"),
-        ({"time": 0, "frame": 1, "channel": LARGER, "value": 1}, "time"),
         ({"channel": LARGER, "value": 1}, "time"),
-        ({"frame": -1, "channel": LARGER, "value": 1}, "frame"),
+        ({"frame": 1, "channel": LARGER, "value": 1}, "frame"),
         ({"time": 0, "channel": LARGER, "value": 1, "interpolation": "cubic"}, "interpolation"),
         ({"time": 0, "channel": LARGER, "value": 1, "slope": "steep"}, "slope"),
         ({"time": 0, "channel": LARGER, "value": 1, "ease": 1}, "ease"),
@@ -149,7 +143,7 @@ def test_what_is_wrong_is_named_with_its_file_and_row(tmp_path: Path, row: objec
     path = tmp_path / "keys.json"
     path.write_text(json.dumps({"keys": [{"time": 9, "channel": "sway", "value": 1}, row]}))
     with pytest.raises(FaceDiffError) as raised:
-        read_direction(path, 25.0)
+        read_direction(path)
     assert [word for word in (str(path), "row 2", field) if word not in str(raised.value)] == []
 
 

@@ -4,8 +4,8 @@ const KINDS = ["step", "linear", "smooth"];
 const SAME_TIME = 1e-6; // s
 const LATEST = 86_400; // s
 const MOST_SLOPE = 1e6; // a second
-const FIELDS = ["format", "version", "frame_rate", "instead_of", "keys"];
-const COLUMNS = ["time", "frame", "channel", "value", "interpolation", "slope"];
+const FIELDS = ["format", "version", "instead_of", "keys"];
+const COLUMNS = ["time", "channel", "value", "interpolation", "slope"];
 
 /** Change a second at each key: as given, or else such that a smooth curve does not overshoot. */
 function slopesOf(keys) {
@@ -207,16 +207,13 @@ class Direction {
     if (!Array.isArray(content?.keys)) throw new Error('holds no list called "keys"');
     const other = Object.keys(content).find((key) => !FIELDS.includes(key));
     if (other !== undefined) throw new Error(`${other}: expected ${FIELDS.join(", ")}`);
-    const { format = facts.format, version = facts.version, frame_rate: rate, instead_of: turned = [], keys: rows } = content;
+    const { format = facts.format, version = facts.version, instead_of: turned = [], keys: rows } = content;
     if (format !== facts.format) throw new Error("is no keys file");
     if (version !== facts.version) throw new Error(`has version ${version}`);
-    if ((rate ?? null) !== null && !(typeof rate === "number" && rate >= 0.1 && rate <= 1000)) {
-      throw new Error("frame_rate: expected 0.1 to 1000");
-    }
     if (!Array.isArray(turned) || turned.some((name) => !facts.insteadOf.includes(name))) {
       throw new Error(`instead_of: expected a list of ${facts.insteadOf.join(", ")}`);
     }
-    const keys = rows.map((row, i) => this.row(row, `row ${i + 1}`, rate ?? facts.frameRate));
+    const keys = rows.map((row, i) => this.row(row, `row ${i + 1}`));
     const seen = new Set();
     keys.forEach(({ channel, time }, i) => {
       if (seen.has(`${time} ${channel}`)) throw new Error(`row ${i + 1}: ${channel} has a key at ${time} s already`);
@@ -225,7 +222,7 @@ class Direction {
     this.set(keys, [...new Set(turned)]);
   }
 
-  row(row, where, frameRate) {
+  row(row, where) {
     const { channel, interpolation = "smooth" } = row ?? {};
     for (const name of Object.keys(row ?? {})) {
       if (!COLUMNS.includes(name)) throw new Error(`${where}: ${name}: expected ${COLUMNS.join(", ")}`);
@@ -236,8 +233,8 @@ class Direction {
     const fits = range ? typeof value === "number" && value >= range[0] && value <= range[1] : typeof value === "string" && value.trim();
     if (!fits) throw new Error(`${where}: value: expected ${range ? `${range[0]} to ${range[1]}` : "a text"}`);
     if (!KINDS.includes(interpolation)) throw new Error(`${where}: interpolation: expected ${KINDS.join(", ")}`);
-    const time = secondsOf(row, frameRate);
-    if (!(time >= 0 && time <= LATEST)) throw new Error(`${where}: time: expected seconds up to a day, a timecode, or a frame`);
+    const time = numberOf(row.time);
+    if (!(typeof time === "number" && time >= 0 && time <= LATEST)) throw new Error(`${where}: time: expected seconds up to a day`);
     if (slope !== null && !(range && Math.abs(slope) <= MOST_SLOPE && typeof slope === "number")) {
       throw new Error(`${where}: slope: expected ${range ? "a number" : "none, since this is a text"}`);
     }
@@ -248,16 +245,4 @@ class Direction {
 /** The number that a text spells, as the command reads cells of a table; anything else as it is. */
 function numberOf(value) {
   return typeof value === "string" && /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(value) ? Number(value) : value;
-}
-
-/** Seconds of a row: a number of them, a timecode (00:00:01:12, 00:00:01.480), or a frame; NaN if it is none, or both. */
-function secondsOf(row, frameRate) {
-  if ("time" in row === "frame" in row) return NaN;
-  const number = numberOf("time" in row ? row.time : row.frame);
-  if (typeof number === "number") return "time" in row ? number : number / frameRate;
-  const found = "time" in row && typeof number === "string" && /^(\d{1,2}):(\d\d):(\d\d)([:;.,])(\d{1,3})$/.exec(number);
-  if (!found) return NaN;
-  const whole = 3600 * found[1] + 60 * found[2] + Number(found[3]);
-  if (".,".includes(found[4])) return whole + found[5] / 10 ** found[5].length;
-  return Number(found[5]) < Math.ceil(frameRate) ? whole + found[5] / frameRate : NaN;
 }
