@@ -203,9 +203,7 @@ DRILLS = [
     ),
     Drill("figure frames", f"{PAPER} --dpi 80 --phonemes m -o a.png", f"{PAPER} --dpi 80 --phonemes f -o a.png"),
     Drill("figure heatmap", f"{PAPER} --dpi 80 -o a.png", f"{PAPER} --dpi 100 -o a.png"),
-    Drill("figure error", f"{PAPER} --dpi 80 -o a.svg", f"{PAPER} --dpi 100 -o a.svg"),
     Drill("figure lips", f"{PAPER} --dpi 80 -o a.pdf", f"{PAPER} --dpi 100 -o a.pdf"),
-    Drill("figure training", "one=curve --width 60 --dpi 50 -o a.png", "one=curve --width 50 --dpi 50 -o a.png"),
     Drill(
         "study make",
         "ours=ours theirs=theirs --truth corpus --mesh corpus/tiny.ply --frame-rate 25 --max-clips 1 "
@@ -268,10 +266,6 @@ def write_inputs(folder: Path, run: object) -> None:
             truth = np.load(corpus / "vertices_npy" / f"{clip}.npy")
             np.save(folder / name / f"{clip}_condition_A.npy", truth + np.float32(moved))
             (corpus / "phonemes" / f"{clip}.csv").write_text(phonemes, encoding="utf-8")
-    (folder / "curve").mkdir()
-    rows = [f"{step},{step},{1 / (step + 1)}" for step in range(30)]
-    (folder / "curve" / "metrics.csv").write_text("\n".join(["epoch,step,train/loss", *rows]))
-
     run(["data", "pack", "corpus", "packed.zarr", "--corpus", TINY, "--workers", "1", "--quiet"], folder)
     (folder / "demo.yaml").write_text(SMALL_MODEL + SMALL_TRAINER)
     (folder / "fit.yaml").write_text(SMALL_MODEL + SMALL_TRAINER + CALLBACKS)

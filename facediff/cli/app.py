@@ -99,9 +99,7 @@ COMMANDS = {
     ),
     "figure frames": Command("facediff.cli.figure:frames", "faces of truth and methods at chosen moments", "figures"),
     "figure heatmap": Command("facediff.cli.figure:heatmap", "mean and deviation of motion at every vertex", "figures"),
-    "figure error": Command("facediff.cli.figure:error", "error at every vertex", "figures"),
     "figure lips": Command("facediff.cli.figure:lips", "lip opening over time", "figures"),
-    "figure training": Command("facediff.cli.figure:training", "training curves of runs", "figures"),
     "study make": Command(
         "facediff.cli.study:make", "make a user study: videos side by side and a page of questions", "study"
     ),

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from facediff.cli.options import (
     File,
     FileOrList,
     FrameRate,
-    Scheduler,
     Truth,
     View,
-    Workers,
     named_folders,
 )
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError, refuse_idle
+from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from facediff.evaluation.figures import FigureData, Paper
 
@@ -160,31 +157,14 @@ def frames(
     report(page.output)
 
 
-@dataclass(frozen=True)
-class MapOptions:
-    """Maps of vertices.
-
-    Attributes:
-        clips: clips to count (default: all that truth and methods have)
-        highest_mean: end of the mean's scale in the unit shown
-        view: camera
-        workers: clips read at a time (default: as many as processors)
-        scheduler: where tasks run: processes, threads, or tcp://HOST:PORT of a Dask cluster (docs/cluster.md)
-    """
-
-    clips: Annotated[list[str] | None, Option(metavar="CLIP", many=True)] = None
-    highest_mean: Highest = None
-    view: View = "front"
-    workers: Workers = None
-    scheduler: Scheduler = None
-
-
 def heatmap(
     predictions: Predictions,
     truth: Truth,
     *,
+    clips: Annotated[list[str] | None, Option(metavar="CLIP", many=True)] = None,
+    highest_mean: Highest = None,
     highest_std: Highest = None,
-    maps: MapOptions,
+    view: View = "front",
     files: FileOptions,
     page: PageOptions,
 ) -> None:
@@ -193,68 +173,18 @@ def heatmap(
     Args:
         predictions: folder of predictions, or NAME=FOLDER
         truth: corpus folder, folder of truths, or puppet
+        clips: clips to count (default: all that truth and methods have)
+        highest_mean: end of the mean's scale in the unit shown
         highest_std: end of the standard deviation's scale
-        maps: which clips, and how they are shown.
+        view: camera
         files: the files to draw from.
         page: how it is printed.
     """
     paper, material = files.gather(predictions, truth, page)
     from facediff.evaluation.figures import draw_heatmap
 
-    draw_maps(draw_heatmap, material, paper, page, maps, highest_std)
-
-
-def error(
-    predictions: Predictions,
-    truth: Truth,
-    *,
-    statistic: Literal["mean", "max", "both"] = "mean",
-    highest_max: Highest = None,
-    maps: MapOptions,
-    files: FileOptions,
-    page: PageOptions,
-) -> None:
-    """Each vertex's error against the truth.
-
-    Args:
-        predictions: folder of predictions, or NAME=FOLDER
-        truth: corpus folder, folder of truths, or puppet
-        statistic: over frames
-        highest_max: end of the maximum's scale
-        maps: which clips, and how they are shown.
-        files: the files to draw from.
-        page: how it is printed.
-    """
-    refuse_idle(
-        f"has no effect on --statistic {statistic}",
-        highest_mean=statistic == "max" and maps.highest_mean is not None,
-        highest_max=statistic == "mean" and highest_max is not None,
-    )
-    paper, material = files.gather(predictions, truth, page)
-    from facediff.evaluation.figures import draw_error
-
-    draw_maps(partial(draw_error, statistic=statistic), material, paper, page, maps, highest_max)
-
-
-def draw_maps(
-    draw: Callable[..., list[str]],
-    material: FigureData,
-    paper: Paper,
-    page: PageOptions,
-    maps: MapOptions,
-    highest: float | None,
-) -> None:
-    """Draw maps of vertices, the second row with the scale up to ``highest``, and report the file."""
-    notes = draw(
-        material,
-        material.choose(maps.clips),
-        page.output,
-        paper=paper,
-        view=maps.view,
-        highest=(maps.highest_mean, highest),
-        workers=maps.workers,
-        scheduler=maps.scheduler,
-    )
+    highest = (highest_mean, highest_std)
+    notes = draw_heatmap(material, material.choose(clips), page.output, paper=paper, view=view, highest=highest)
     report(page.output, notes)
 
 
@@ -297,35 +227,6 @@ def lips(
     sound = SpeechTrack(phonemes=phonemes) if samples is None else SpeechTrack(samples, phonemes=phonemes)
     draw_lips(curves, sound, page.output, paper=paper, scale=material.scale, span=span, remark=material.remark)
     report(page.output, notes)
-
-
-def training(
-    runs: Annotated[list[str], Option(metavar="RUN", reads=True)],
-    *,
-    scalar: Annotated[list[str] | None, Option(metavar="NAME")] = None,
-    smooth: Annotated[ranges.Smoothing, Option(metavar="W")] = 0.0,
-    log: bool = False,
-    x: Literal["step", "epoch"] = "step",
-    page: PageOptions,
-) -> None:
-    """Curves of one or several training runs from their metrics.csv.
-
-    Args:
-        runs: run folder with metrics.csv, or NAME=FOLDER
-        scalar: such as val/lve, repeatable (default: train/loss, val/lve)
-        smooth: weight of the past, 0 to below 1
-        log: logarithmic values
-        x: the horizontal axis
-        page: how it is printed.
-    """
-    folders = named_folders(runs, lambda path: "/".join(path.resolve().parts[-2:]).removeprefix("/"))
-    paper = page.paper()
-    from facediff.evaluation.figures import choose_scalars, draw_training, find_gaps, find_metrics, read_curves
-
-    curves = {name: read_curves(find_metrics(folder), x) for name, folder in folders.items()}
-    scalars = choose_scalars(curves, scalar)
-    draw_training(curves, scalars, page.output, paper=paper, axis=x, smoothing=smooth, log=log)
-    report(page.output, find_gaps(curves, scalars, log=log))
 
 
 def report(output: Path, notes: Sequence[str] = ()) -> None:

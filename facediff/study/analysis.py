@@ -239,8 +239,10 @@ def preferences_of(
             preferred = wins + same / 2
             between = share_between_raters(better, table.sum(1), level, resamples=resamples, seed=seed)
             interval, p = wilson_interval(preferred, count, level), binomial_p(wins, wins + losses)
-            facts = (wins, losses, same, preferred / count, interval, between, p)
-            preferences.append(Preference(question, *pair, *facts, 1.0))
+            share = preferred / count
+            preferences.append(
+                Preference(question, *pair, wins, losses, same, share, interval, between, p, p_corrected=1.0)
+            )
     corrected = holm([preference.p for preference in preferences])
     return [replace(preference, p_corrected=p) for preference, p in zip(preferences, corrected, strict=True)]
 

@@ -54,7 +54,6 @@ Samples = Annotated[int, Range(1, 1000)]
 Seconds = Annotated[float, Range(0, 86_400)]
 Seed = Annotated[int, Range(0, 2**62 - 1)]
 """The generators of random numbers take 64 bits, and the numbers of clips and samples are added to the seed."""
-Smoothing = Annotated[float, Range(0, 1, below=True)]
 Steps = Annotated[int, Range(1, 10_000)]
 Strength = Annotated[float, Range(0, 1e6)]
 Stride = Annotated[int, Range(1, 1000)]

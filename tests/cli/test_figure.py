@@ -20,7 +20,7 @@ from tests.fakes.words import last_of_each
 
 TINY = ["--topology", "tests.fakes.tiny.Tiny"]
 SMALL = ["--width", "85", "--dpi", "80"]
-FIGURES = ("frames", "heatmap", "error", "lips", "training")
+FIGURES = ("frames", "heatmap", "lips")
 PHONEMES = "start,end,ipa,viseme\n0,0.10,,SIL\n0.10,0.20,m,PP\n0.20,0.30,ˈɑː,AA\n0.30,0.9,f,FF\n"
 
 
@@ -35,23 +35,14 @@ def corpus(tiny_root: Path, tmp_path: Path) -> Path:
         for clip in ("A_e06", "A_e07"):
             truth = np.load(root / "vertices_npy" / f"{clip}.npy")
             np.save(tmp_path / name / f"{clip}_condition_A.npy", truth + np.float32(moved))
-    (tmp_path / "run").mkdir()
-    rows = [f"{step},{step},{1 / (step + 1)}" for step in range(30)]
-    (tmp_path / "run" / "metrics.csv").write_text("\n".join(["epoch,step,train/loss", *rows]))
     return root
 
 
 def words(figure: str, corpus: Path, *more: str) -> list[str]:
     folder = corpus.parent
     files = [str(folder / "ours"), str(corpus), "--method", f"other={folder / 'theirs'}", *TINY]
-    given = {
-        "frames": [*files, "--phonemes", "m", "ɑː"],
-        "heatmap": files,
-        "error": files,
-        "lips": files,
-        "training": [f"one={folder / 'run'}", f"two={folder / 'run' / 'metrics.csv'}"],
-    }[figure]
-    return last_of_each(["figure", figure, *given, *SMALL, "-o", str(folder / "figure.png"), *more])
+    files += ["--phonemes", "m", "ɑː"] if figure == "frames" else []
+    return last_of_each(["figure", figure, *files, *SMALL, "-o", str(folder / "figure.png"), *more])
 
 
 @pytest.mark.parametrize("figure", FIGURES)
@@ -146,14 +137,13 @@ def test_what_does_not_fit_is_one_sentence(
         ("lips --clip B_e01", 'ours: there is no clip "B_e01"'),
         ("frames --phonemes z", "in clip A_e06: known are m, ɑː, f"),
         ("frames --times 0.1", "either --times or --phonemes"),
-        ("error --mesh other.ply", "has 4 vertices, the motion 24"),
-        ("error --topology biwy", 'did you mean "biwi"'),
-        ("error --method ours=ours", 'already one called "ours"'),
-        ("error --method truth=ours", 'a method cannot be called "truth"'),
-        ("error --identity B", "under the condition B"),
+        ("heatmap --mesh other.ply", "has 4 vertices, the motion 24"),
+        ("heatmap --topology biwy", 'did you mean "biwi"'),
+        ("heatmap --method ours=ours", 'already one called "ours"'),
+        ("heatmap --method truth=ours", 'a method cannot be called "truth"'),
+        ("heatmap --identity B", "under the condition B"),
         ("lips --lip-pairs 3-900", "--lip-pairs 3-900"),
         ("lips --span 0.03 0.05", "holds no frame"),
-        ("training --scalar train/los", 'did you mean "train/loss"'),
         ("frames --lips all", "--lips: has no effect without --close-up"),
     ):
         figure, *more = wrong.split()
@@ -173,7 +163,7 @@ def test_the_built_in_corpus_by_name(
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
-    given = ["figure", "error", "ours", "puppet", *TINY, *SMALL, "-o", "a.png"]
+    given = ["figure", "heatmap", "ours", "puppet", *TINY, *SMALL, "-o", "a.png"]
     assert main(given) == 2
     assert "`facediff demo` makes it" in capsys.readouterr().err
     shutil.copytree(corpus, cache_root(0, drawn))

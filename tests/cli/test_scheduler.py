@@ -19,7 +19,7 @@ from facediff.data.prepare.biwi import plan
 
 ROOT = Path(__file__).parents[2]
 TINY = "tests.fakes.tiny.Tiny"
-SHARED = ("animate", "benchmark", "data check", "evaluate", "figure error", "figure heatmap", "study make")
+SHARED = ("animate", "benchmark", "data check", "evaluate", "study make")
 
 
 @pytest.fixture

@@ -50,7 +50,6 @@ MISTAKES = [
     "retarget missing.npz --target-mesh missing.obj -o a.npz",
     "evaluate missing truth",
     "figure lips missing truth -o a.png",
-    "figure training missing -o a.png",
     "data check missing",
     "data regions missing",
     "data import-person missing --audio a --name b --corpus c -o d --frame-rate 25",
@@ -59,7 +58,7 @@ MISTAKES = [
     "study serve missing --prot 3",
     "study report",
     "study report missing",
-    "study report --plan 0.7",
+    "study report a --level 7",
     "components samplr",
     "demo --epoch 3",
 ]

@@ -84,7 +84,7 @@ def simulate(
     rng, scores = np.random.default_rng(seed), {"still": -6.0, **scores}
 
     def rater(number: int) -> Rater:
-        answers = {}
+        answers: dict[str, Answer] = {}
         for trial in study.trials_of(number):
             replies = {}
             for question, allowed in questions_of(study, trial).items():

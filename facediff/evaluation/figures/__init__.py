@@ -1,7 +1,7 @@
 """The figures of a paper: faces, heat maps and curves of truth and methods, in the sizes and formats of journals.
 
-The numbers in a figure are computed by functions of their own (`motion_maps`, `error_maps`, `opening_curves`,
-`read_curves`), which need no matplotlib; drawing needs the extra ``figures``.
+The numbers in a figure are computed by functions of their own (`motion_maps`, `opening_curves`), which need no
+matplotlib; drawing needs the extra ``figures``.
 """
 
 from facediff.evaluation.figures.frames import (
@@ -11,26 +11,16 @@ from facediff.evaluation.figures.frames import (
     frame_at,
     pick_frames,
 )
-from facediff.evaluation.figures.heatmaps import VertexMap, draw_error, draw_heatmap, error_maps, motion_maps
+from facediff.evaluation.figures.heatmaps import VertexMap, draw_heatmap, motion_maps
 from facediff.evaluation.figures.lips import Curves, SpeechTrack, draw_lips, opening_curves
 from facediff.evaluation.figures.material import FigureData, find_clips
 from facediff.evaluation.figures.page import COLUMN, PAGE, Paper
-from facediff.evaluation.figures.training import (
-    Curve,
-    choose_scalars,
-    draw_training,
-    find_gaps,
-    find_metrics,
-    read_curves,
-    smooth,
-)
 from facediff.evaluation.file_pairs import read_pairs
 from facediff.speech.phonemes import TimedPhoneme, read_phonemes
 
 __all__ = [
     "COLUMN",
     "PAGE",
-    "Curve",
     "Curves",
     "FigureData",
     "Moment",
@@ -38,23 +28,15 @@ __all__ = [
     "TimedPhoneme",
     "SpeechTrack",
     "VertexMap",
-    "choose_scalars",
-    "draw_error",
     "draw_frames",
     "draw_heatmap",
     "draw_lips",
-    "draw_training",
-    "error_maps",
     "find_clips",
-    "find_gaps",
-    "find_metrics",
     "find_phoneme",
     "frame_at",
     "motion_maps",
     "opening_curves",
     "pick_frames",
-    "read_curves",
     "read_pairs",
     "read_phonemes",
-    "smooth",
 ]

@@ -16,18 +16,15 @@ from PIL import Image
 
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import (
-    Curve,
     Curves,
     FigureData,
     Moment,
     Paper,
     SpeechTrack,
     TimedPhoneme,
-    draw_error,
     draw_frames,
     draw_heatmap,
     draw_lips,
-    draw_training,
 )
 from facediff.evaluation.figures import lips as lips_module
 from facediff.evaluation.figures.material import FLAT, Painter
@@ -45,10 +42,6 @@ PHONEMES = [
     TimedPhoneme(0.5, 1.0, "ˈɑː", "AA"),
     TimedPhoneme(1, 1.1, "ʃ"),
 ]
-RUNS = {
-    "long": {"val/lve": Curve(np.arange(40.0), np.exp(-np.arange(40) / 9.0))},
-    "short": {"val/lve": Curve(np.arange(3.0), np.array([1.0, np.nan, 0.2]))},
-}
 
 
 def draw(name: str, material: FigureData, path: Path) -> None:
@@ -56,21 +49,15 @@ def draw(name: str, material: FigureData, path: Path) -> None:
         draw_frames(material, "A_e06", [Moment(0.1, PHONEMES[1]), Moment(0.5)], path, paper=SMALL)
     elif name == "heatmap":
         draw_heatmap(material, ["A_e06"], path, paper=SMALL)
-    elif name == "error":
-        draw_error(material, ["A_e06"], path, paper=SMALL, statistic="both", highest=(1.0, None))
-    elif name == "lips":
+    else:
         sound = SpeechTrack(SPEECH, phonemes=PHONEMES)
         draw_lips(LIPS, sound, path, paper=SMALL, scale=(1000, "mm"), remark="tiny: synthetic corpus")
-    else:
-        draw_training(RUNS, ["val/lve"], path, paper=SMALL, smoothing=0.6, log=True)
 
 
 TEXTS = {
     "frames": ["truth", "ours", "theirs", "/m/", "0.10 s", "0.50 s", "tiny: synthetic corpus"],
     "heatmap": ["truth", "ours", "theirs", "mean of motion [mm]", "std of motion [mm]", "tiny: synthetic corpus"],
-    "error": ["ours", "theirs", "mean error [mm]", "maximum error [mm]"],
     "lips": ["truth", "ours", "th$irs", "lip opening [mm]", "time [s]", "m", "ɑː", "ʃ", "/p/, /b/, /m/", "sound"],
-    "training": ["long", "short", "val/lve", "step"],
 }
 
 
@@ -146,8 +133,8 @@ def test_colours_of_the_heat_map_are_those_of_the_bar(own_material: FigureData, 
         picture = painter.paint(shape, np.tile(heat_ramp()[level], (len(shape), 1)))
         drawn = picture[(picture != 255).any(-1)].astype(int)
         np.testing.assert_allclose(np.median(drawn, axis=0), heat_ramp()[level], atol=4)
-    draw_error(own_material, ["A_e06"], tmp_path / "error.png", paper=SMALL)
-    with Image.open(tmp_path / "error.png") as picture:
+    draw_heatmap(own_material, ["A_e06"], tmp_path / "heat.png", paper=SMALL)
+    with Image.open(tmp_path / "heat.png") as picture:
         pixels = {tuple(int(c) for c in pixel) for pixel in np.asarray(picture.convert("RGB")).reshape(-1, 3)}
     assert sum(tuple(map(int, colour)) in pixels for colour in heat_ramp()) > 60  # the bar
 
@@ -200,7 +187,7 @@ def test_the_grid_leaves_room_for_its_labels() -> None:
 
 def test_fonts(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r'--font: there is no font "DejaVu Sanss": did you mean "DejaVu Sans'):
-        draw_training(RUNS, ["val/lve"], tmp_path / "a.png", paper=Paper(font="DejaVu Sanss"))
+        draw_lips(LIPS, SpeechTrack(), tmp_path / "a.png", paper=Paper(font="DejaVu Sanss"))
     assert list(tmp_path.iterdir()) == []
 
 

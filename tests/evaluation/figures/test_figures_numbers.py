@@ -14,14 +14,10 @@ from facediff.errors import FaceDiffError
 from facediff.evaluation.figures import (
     FigureData,
     Moment,
-    choose_scalars,
-    find_metrics,
     find_phoneme,
     frame_at,
     pick_frames,
-    read_curves,
     read_phonemes,
-    smooth,
 )
 
 CLIPS = ["A_e06", "A_e07", "B_e06"]
@@ -68,33 +64,3 @@ def test_a_phoneme_is_found_at_its_middle(tmp_path: Path) -> None:
         find_phoneme("z", phonemes, "A_e06")
     assert Moment(0.15, phonemes[1]).heading.large == "/m/"
     assert Moment(0.15, replace(phonemes[1], word="map")).heading.large == "/m/ map"
-
-
-CSV = "epoch,lr,step,train/loss,val/lve\n,0.1,0,,\n0,,0,4.0,\n0,,9,2.0,\n0,,9,,0.5\n1,,19,nan,\n1,,19,,0.25\n"
-
-
-def test_curves_of_a_run(tmp_path: Path) -> None:
-    (tmp_path / "metrics.csv").write_text(CSV)
-    curves = read_curves(find_metrics(tmp_path))
-    assert set(curves) == {"lr", "train/loss", "val/lve"}
-    np.testing.assert_array_equal(curves["train/loss"].at, [0, 9, 19])
-    np.testing.assert_array_equal(curves["train/loss"].values, [4, 2, np.nan])
-    np.testing.assert_array_equal(curves["val/lve"].values, [0.5, 0.25])
-    by_epoch = read_curves(tmp_path / "metrics.csv", "epoch")
-    np.testing.assert_array_equal(by_epoch["val/lve"].at, [0, 1])
-    np.testing.assert_array_equal(by_epoch["train/loss"].values, [2, np.nan])  # the epoch's last
-    runs = {"one": curves, "two": curves}
-    assert choose_scalars(runs, None) == ["train/loss", "val/lve"]
-    with pytest.raises(FaceDiffError, match=r'--scalar: one: there is no scalar "val/lvee".*did you mean "val/lve"'):
-        choose_scalars(runs, ["val/lvee"])
-    with pytest.raises(FaceDiffError, match="known are lr"):
-        choose_scalars({"one": {"lr": curves["lr"]}}, None)
-
-
-def test_smoothing_is_the_weighted_mean_of_the_past() -> None:
-    values = np.array([3.0, 1.0, 4.0, 1.0, 5.0])
-    for place, found in enumerate(smooth(values, 0.7)):
-        weights = 0.7 ** np.arange(place, -1, -1)
-        assert found == pytest.approx((weights * values[: place + 1]).sum() / weights.sum())
-    np.testing.assert_array_equal(smooth(values, 0.0), values)
-    np.testing.assert_allclose(smooth(np.array([2.0, np.nan, 2.0]), 0.9), [2, np.nan, 2])

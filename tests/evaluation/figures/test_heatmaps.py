@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from facediff.evaluation.figures import (
-    FigureData,
-    error_maps,
-    motion_maps,
-)
+from facediff.evaluation.figures import FigureData, motion_maps
 from facediff.evaluation.figures import material as material_module
 from facediff.utils.pickles import load_pickle
 
@@ -42,18 +38,4 @@ def test_motion_maps_are_distances_from_the_identitys_template(
         )
         np.testing.assert_allclose(found.mean, far.mean(0), rtol=1e-9)
         np.testing.assert_allclose(found.deviation, far.std(0), rtol=1e-9)
-        np.testing.assert_allclose(found.maximum, far.max(0), rtol=1e-12)
         assert found.frames == len(far)
-
-
-@pytest.mark.usefixtures("chunk")
-def test_error_maps_are_distances_from_the_truth(own_material: FigureData, read: Read) -> None:
-    maps, _ = error_maps(own_material, ["A_e07", "B_e06"])
-    assert list(maps) == NAMES[1:]
-    for name, found in maps.items():
-        far = np.concatenate(
-            [np.sqrt(((read(name, clip) - read("truth", clip)) ** 2).sum(2)) for clip in ("A_e07", "B_e06")]
-        )
-        np.testing.assert_allclose(found.mean, far.mean(0), rtol=1e-9)
-        np.testing.assert_allclose(found.maximum, far.max(0), rtol=1e-12)
-        np.testing.assert_allclose(found.deviation, far.std(0), rtol=1e-9)
