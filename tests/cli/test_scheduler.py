@@ -38,12 +38,9 @@ def place(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
 
 def commands(out: str) -> list[list[str]]:
     """One of each sort, without a model."""
-    page = ["--topology", TINY, "--width", "85", "--dpi", "60"]
     return [
         ["evaluate", "ours", "corpus", "--bootstrap", "20", "--quiet", "--json", f"{out}/scores.json"],
         ["data", "check", "corpus", "--corpus", TINY, "--quiet"],
-        ["figure", "heatmap", "ours", "corpus", *page, "-o", f"{out}/heatmap.png"],
-        ["figure", "error", "ours", "corpus", "--statistic", "both", *page, "-o", f"{out}/error.png"],
     ]
 
 
@@ -77,7 +74,7 @@ def test_threads_write_what_is_written_without_the_option(place: Path, capsys: p
             assert main([*words, *more]) == 0
         printed.append(capsys.readouterr().out.replace(out, ""))
     assert written(place / "usual") == written(place / "other")
-    assert len(written(place / "usual")) == 3
+    assert len(written(place / "usual")) == 1
     assert printed[0] == printed[1]
 
 
