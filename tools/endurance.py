@@ -122,7 +122,7 @@ def visit(address: str, until: float, failures: list[str]) -> None:
 def performing(args: argparse.Namespace, until: float) -> Running:
     """``facediff live`` with the recording on standard input."""
     receivers = [f"{scheme}://127.0.0.1:{listener()}" for scheme in ("livelink", "vmc", "osc")]
-    receivers.append(f"jsonl:{free_port()}")
+    receivers.append("jsonl:frames.jsonl")
     command = ["live", "-", "--shapes", "puppet", *(word for address in receivers for word in ("--to", address))]
     with open(args.output / "live.log", "w") as log:
         process = start([*command], args, stdin=subprocess.PIPE, stdout=log, stderr=log)

@@ -11,9 +11,7 @@ from facediff.errors import FaceDiffError, printable
 from facediff.live.frames import OPTION, Performance, Receiver, open_receivers
 from facediff.live.loop import LiveSummary, Loop, Solver
 from facediff.live.model import LiveModel
-from facediff.live.options import OUT, RECEIVERS, LiveOptions
-from facediff.live.sound import SoundOut
-from facediff.live.sources import USUAL
+from facediff.live.options import LiveOptions
 
 Report = Callable[[str], None]
 
@@ -25,9 +23,6 @@ def perform(
     options.check()
     # What fails quickly comes first: a model takes seconds to open.
     receivers = open_receivers(options.to or [])
-    sound = None
-    if options.plays.partition(":")[0] == OUT:
-        sound = SoundOut(options.plays.partition(":")[2] or USUAL)
     if options.shapes is not None:
         from facediff.editing.shapes import check_shapes
 
@@ -41,7 +36,6 @@ def perform(
     if unsolved and not model.weights:
         raise needs_shapes(weighted[0])
     names, solve = (model.weights, None) if options.shapes is None or not weighted else solver(options.shapes, model)
-    outputs = [*receivers, *([] if sound is None else [sound])]
     performance = Performance(
         frame_rate=model.frame_rate,
         neutral=model.neutral,
@@ -49,11 +43,11 @@ def perform(
         unit=model.unit,
         shapes=names,
         colours=model.colours,
-        speech=options.plays == RECEIVERS,
+        speech=options.plays,
         metadata=dict(model.metadata),
     )
     model.warm_up()
-    with opened(outputs, performance):
+    with opened(receivers, performance):
         if not options.quiet:
             report(
                 f"ready; {source.name}; {model.frame_rate:g} frames a second, each {model.lag:.2f} s after its speech "
@@ -62,15 +56,13 @@ def perform(
         loop = Loop(
             model,
             source,
-            outputs,
-            hearing=receivers if options.plays == RECEIVERS else [] if sound is None else [sound],
+            receivers,
+            hearing=options.plays,
             solve=solve,
             seconds=options.seconds,
             report=report,
             every=None if options.quiet else 5.0,
         )
-        if sound is not None:
-            sound.follow(loop.clock, loop.pacer)
         summary = loop.run()
     for sentence in summary.sentences():
         report(sentence)

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from operator import methodcaller
 
 import numpy as np
 import numpy.typing as npt
@@ -182,7 +183,7 @@ class Loop:
         model: animates.
         source: of the speech.
         receivers: of the frames; they are open, and closed by the caller.
-        hearing: the receivers that play the speech.
+        hearing: whether receivers play the speech.
         solve: finds weights of blendshapes for receivers that need them; None to send those that the model gives.
         seconds: of speech, after which it ends; None for the source's own end.
         report: prints a sentence.
@@ -195,7 +196,7 @@ class Loop:
         source: SpeechSource,
         receivers: Sequence[Receiver],
         *,
-        hearing: Sequence[Receiver] = (),
+        hearing: bool = False,
         solve: Solver | None = None,
         seconds: float | None = None,
         report: Callable[[str], None] = print,
@@ -386,7 +387,7 @@ class Loop:
                 if frame is None and self._ended and not speech:
                     return
             for samples, start in speech:
-                self._each(self.hearing, self._speaking(samples, start))
+                self._each(methodcaller("hear", samples, start))
             if frame is None:
                 continue
             if weights[0] != frame.index and self._solve is not None and not self._late(frame):
@@ -441,7 +442,7 @@ class Loop:
             dropped=self.summary.dropped + self._backlog.dropped,
             head=frame.head,
         )
-        self._each(self.receivers, lambda receiver: receiver.send(out))
+        self._each(methodcaller("send", out))
         timestamp = time.monotonic()
         self.summary.frames += 1
         self.summary.lag.add(timestamp - frame.spoken)
@@ -449,19 +450,15 @@ class Loop:
         self.summary.waiting.add(began - frame.ready)
         self.summary.sending.add(timestamp - began + solving)
 
-    def _each(self, receivers: Sequence[Receiver], do: Callable[[Receiver], None]) -> None:
+    def _each(self, do: Callable[[Receiver], None]) -> None:
         """Do something with every receiver; one that fails, which none should, does not end the others."""
-        for receiver in receivers:
+        for receiver in self.receivers:
             try:
                 do(receiver)
             except Exception as error:  # noqa: BLE001 - a third party's receiver may raise anything
                 if receiver.name not in self._failing:
                     self._failing.add(receiver.name)
                     self._report(f"{receiver.name}: {type(error).__name__}: {error}")
-
-    @staticmethod
-    def _speaking(samples: Speech, start: float) -> Callable[[Receiver], None]:
-        return lambda receiver: receiver.hear(samples, start)
 
     def _tell(self) -> None:
         """Report on the last seconds."""

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from facediff.animation.options import CheckedOptions
-from facediff.errors import FaceDiffError, OptionError, refuse_idle
+from facediff.errors import FaceDiffError, refuse_idle
 from facediff.registry import receiver
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
     from facediff.live.sources import SpeechSource
-
-OFF, OUT, RECEIVERS = "off", "out", "receivers"
-"""Where speech is played: nowhere, on a sound device (``out:NAME`` for one by its name), by receivers that can."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +27,8 @@ class LiveOptions(CheckedOptions):
             `facediff components receiver`)
         shapes: blendshapes for receivers that take weights: folder of meshes, .glb with targets, or "puppet" (built in;
             the default for the model that comes with facediff)
-        sound: where the speech is played, delayed to match: off, out (a sound device; out:NAME for one by its name), or
-            receivers (the page in the browser) (default: receivers for a recording, else off)
+        sound: where the speech is played, delayed to match: off, or receivers (the page in the browser) (default:
+            receivers for a recording, else off)
         seconds: end after so much speech
         quiet: report at the end only
         speech: a recording; ``-`` for standard input; None for a microphone
@@ -41,7 +38,7 @@ class LiveOptions(CheckedOptions):
     rate: Annotated[ranges.SampleRate, Option(metavar="HZ")] = 16_000
     to: Annotated[list[str] | None, Option(metavar="ADDRESS")] = None
     shapes: Annotated[Path | None, Option(metavar="SHAPES", reads=True)] = None
-    sound: Annotated[str | None, Option(metavar="WHERE")] = None
+    sound: Literal["off", "receivers"] | None = None
     seconds: Annotated[ranges.Duration | None, Option(metavar="S")] = None
     quiet: bool = False
     speech: Annotated[str | None, Option(hidden=True)] = None
@@ -56,14 +53,11 @@ class LiveOptions(CheckedOptions):
         refuse_idle("is for samples on standard input", rate=self.speech != "-" and self.rate != 16_000)
         if not self.to:
             raise FaceDiffError(f"--to: missing; give a receiver, one of {', '.join(receiver.names())}")
-        if self.sound is not None and self.sound.partition(":")[0] not in (OFF, OUT, RECEIVERS):
-            raise OptionError("sound", f"expected {OFF}, {OUT}, {OUT}:DEVICE or {RECEIVERS}", self.sound)
 
     @property
-    def plays(self) -> str:
-        """Where speech is played; nowhere for a microphone, which playing would feed back."""
-        default = RECEIVERS if self.speech not in (None, "-") else OFF
-        return default if self.sound is None else self.sound
+    def plays(self) -> bool:
+        """Whether receivers play the speech; not by default that of a microphone, which playing would feed back."""
+        return self.speech not in (None, "-") if self.sound is None else self.sound == "receivers"
 
     def source(self) -> SpeechSource:
         """Where the speech comes from."""

@@ -122,8 +122,8 @@ class Microphone(SpeechSource):
     """
 
     def __init__(self, device: str = USUAL) -> None:
-        self._sound = sound_library("a microphone")
-        self._device, about = find_device(self._sound, device, "input")
+        self._sound = sound_library()
+        self._device, about = find_device(self._sound, device)
         self.rate = round(float(about["default_samplerate"]))
         self.name = f"microphone {about['name']}"
         self.lost = 0
@@ -167,41 +167,36 @@ class Microphone(SpeechSource):
             raise _refused(self.name, error) from error
 
 
-def sound_library(feature: str) -> Any:  # noqa: ANN401 - a module without types
+def sound_library() -> Any:  # noqa: ANN401 - a module without types
     """The library that speaks to sound devices."""
     try:
         import sounddevice
     except ImportError as error:
-        raise MissingExtraError("sounddevice", "live", feature) from error
+        raise MissingExtraError("sounddevice", "live", "a microphone") from error
     except OSError as error:  # its package for Linux comes without PortAudio
         raise FaceDiffError(
-            f"{feature} needs PortAudio, which is not installed; install it (apt-get install libportaudio2), or "
-            f"do without: a recording or samples on standard input need none with --sound off"
+            "--microphone needs PortAudio, which is not installed; install it (apt-get install libportaudio2), or give "
+            "a recording or samples on standard input"
         ) from error
     return sounddevice
 
 
-def find_device(library: Any, device: str, kind: str) -> tuple[int, dict[str, Any]]:  # noqa: ANN401
-    """The number and the facts of a sound device.
+def find_device(library: Any, device: str) -> tuple[int, dict[str, Any]]:  # noqa: ANN401
+    """The number and the facts of an input device.
 
     Args:
         library: of :func:`sound_library`.
         device: its number or a part of its name; ``default`` for the system's choice.
-        kind: ``input`` or ``output``.
     """
-    word = "--microphone" if kind == "input" else "--sound"
     try:
         devices = list(library.query_devices())
     except (library.PortAudioError, OSError) as error:
-        raise FaceDiffError(f"{word}: no sound device can be asked for ({error}); give a recording") from error
-    fit = {number: facts for number, facts in enumerate(devices) if facts[f"max_{kind}_channels"] > 0}
+        raise FaceDiffError(f"--microphone: no sound device can be asked for ({error}); give a recording") from error
+    fit = {number: facts for number, facts in enumerate(devices) if facts["max_input_channels"] > 0}
     if not fit:
-        raise FaceDiffError(
-            f"{word}: there is no {kind} device; connect one"
-            + (", or give a recording, or samples on standard input" if kind == "input" else ", or leave it out")
-        )
+        raise FaceDiffError("--microphone: there is no input device; connect one, or give a recording")
     if device == USUAL:
-        default = library.default.device[0 if kind == "input" else 1]
+        default = library.default.device[0]
         number = default if default in fit else next(iter(fit))
         return number, fit[number]
     matches = [
@@ -211,8 +206,8 @@ def find_device(library: Any, device: str, kind: str) -> tuple[int, dict[str, An
     if len(matches) == 1 or exact:
         return (exact or matches)[0], fit[(exact or matches)[0]]
     names = [f"{number}: {facts['name']}" for number, facts in fit.items()]
-    problem = "several devices are called so" if matches else f"there is no {kind} device of this name or number"
-    raise FaceDiffError(f"{word} {device}: {problem}; {choices(device, names)}")
+    problem = "several devices are called so" if matches else "there is no input device of this name or number"
+    raise FaceDiffError(f"--microphone {device}: {problem}; {choices(device, names)}")
 
 
 def _refused(name: str, error: Exception) -> FaceDiffError:

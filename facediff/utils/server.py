@@ -192,7 +192,7 @@ def run_server(
 
     app = app_of(stop)
     try:
-        listening = _listen(host, port)
+        listening = listen(host, port)
     except (OSError, ValueError) as error:  # a name that is none, or an address in use
         reason = getattr(error, "strerror", None) or brief(error)
         raise FaceDiffError(
@@ -209,7 +209,8 @@ def run_server(
     return bool(stopped)
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that others connect to."""
     family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     listening = socket.socket(family[0], socket.SOCK_STREAM)
     try:

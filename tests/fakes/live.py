@@ -153,7 +153,6 @@ class FakeSound(SimpleNamespace):
             query_devices=lambda: devices,
             check_input_settings=lambda **_: None,
             InputStream=lambda **words: self._open(**words),
-            OutputStream=lambda **words: self._open(**words),
         )
         self.refuse, self.opened = refuse, list[Any]()
 
@@ -175,9 +174,6 @@ class FakeStreamOfSound(SimpleNamespace):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def start(self) -> None:
-        """Nothing: callbacks are called by hand."""
 
     def stop(self) -> None:
         self.active = False

@@ -21,7 +21,7 @@ from facediff.spaces import Rotation, Space
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.decoding import ChannelDecoder
 from facediff.speech.voice_activity import EnergyGate, Openness, read_gate
-from tests.fakes.live import FakeSound, Kept, device, fake_model
+from tests.fakes.live import Kept, fake_model
 
 MADE: list[Kept] = []
 
@@ -68,17 +68,6 @@ def test_performance_from_a_recording_to_receivers(speech: Path) -> None:
     assert (performance.frame_rate, performance.speech, performance.metadata["licence"]) == (50.0, True, "none")
     assert sum(len(samples) for samples, _ in MADE[0].speech) == 4800  # a recording is heard, too
     assert any("lag" in sentence for sentence in said)
-
-
-def test_speech_goes_to_a_sound_device_instead_of_the_receivers(speech: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sound = FakeSound(device("Phones", 0, 2))
-    monkeypatch.setitem(sys.modules, "sounddevice", sound)  # type: ignore[arg-type]
-    said: list[str] = []
-    perform(LiveOptions(speech=str(speech), to=["keep:1"], sound="out:phones"), fake_model, said.append)
-    assert not MADE[0].speech
-    assert len(MADE[0].frames) == 15
-    [stream] = sound.opened
-    assert stream.closed
 
 
 def test_receiver_that_cannot_open_closes_those_before_it(speech: Path) -> None:
@@ -203,7 +192,7 @@ def test_a_wrong_model_loads_neither_pytorch_nor_scipy() -> None:
     program = (
         "import sys\n"
         "for name in ('torch', 'scipy', 'lightning', 'jsonargparse', 'sounddevice'): sys.modules[name] = None\n"
-        "import facediff.live.command, facediff.live.sound, facediff.editing.live_weights, facediff.editing.shapes\n"
+        "import facediff.live.command, facediff.live.sources, facediff.editing.live_weights, facediff.editing.shapes\n"
         "from facediff.cli.app import main\n"
         "sys.exit(main(['live', 'nowhere', '--microphone', '--to', 'nothing:1']))"
     )

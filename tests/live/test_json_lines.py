@@ -1,10 +1,9 @@
-"""JSON lines: their schema, files that appear whole, and clients that come, go and are slow."""
+"""JSON lines: their schema, files that appear whole, and readers that are slow."""
 
 from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,15 +13,9 @@ import numpy as np
 import pytest
 
 from facediff.errors import counted
-from facediff.live.receivers.json_lines import MOST_CLIENTS
 from facediff.spaces.arkit import ARKIT
-from tests.fakes.waiting import PATIENCE, free_port, wait_until
+from tests.fakes.waiting import PATIENCE, wait_until
 from tests.live.conftest import FRAME_RATE, VERTICES, Opened, frame, weights_of
-
-
-def connect(port: int) -> socket.socket:
-    client = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
-    return client
 
 
 def wait_for(receiver: object, words: str) -> None:
@@ -60,42 +53,6 @@ def test_vertices_are_offsets_from_the_neutral_face(opened: Opened, tmp_path: Pa
     np.testing.assert_allclose(only["vertices"], frame(2).vertices, atol=1e-6)
 
 
-def test_several_clients_each_get_whole_lines_from_when_they_came(opened: Opened) -> None:
-    port = free_port()
-    receiver = opened(f"jsonl:{port}")
-    streams = []
-    for begin in (0, 10):
-        client = connect(port)
-        streams.append(client.makefile("rb"))
-        client.close()  # the stream goes on
-        wait_for(receiver, counted(len(streams), "client"))
-        assert json.loads(streams[-1].readline())["type"] == "performance"
-        for index in range(begin, begin + 10):
-            receiver.send(frame(index))
-            # Nobody is slow: each frame is read before the next one is sent.
-            assert [json.loads(stream.readline())["index"] for stream in streams] == [index] * len(streams)
-    receiver.close()
-    for stream, frames in zip(streams, (20, 10), strict=True):
-        with stream:
-            assert json.loads(stream.readline()) == {"type": "end", "frames": frames, "dropped": 0}
-            assert stream.readline() == b""
-
-
-def test_a_slow_client_misses_frames_and_the_others_do_not(opened: Opened) -> None:
-    port = free_port()
-    receiver = opened(f"jsonl://127.0.0.1:{port}?vertices=true")
-    slow, quick = connect(port), connect(port)
-    wait_for(receiver, "2 clients")
-    with quick.makefile("rb") as stream:
-        stream.readline()
-        for index in range(300):
-            receiver.send(frame(index))  # does not wait for the slow one, who never reads
-            assert json.loads(stream.readline())["index"] == index
-    assert "missed by slow ones" in receiver.status()
-    quick.close()
-    slow.close()
-
-
 def test_a_frame_that_is_not_finite_is_left_out(opened: Opened, tmp_path: Path) -> None:
     receiver = opened(f"jsonl:{tmp_path / 'a.jsonl'}")
     receiver.send(replace(frame(0), weights=np.full(len(ARKIT), np.nan, np.float32)))
@@ -104,32 +61,6 @@ def test_a_frame_that_is_not_finite_is_left_out(opened: Opened, tmp_path: Path) 
     _, only, end = [json.loads(text) for text in (tmp_path / "a.jsonl").read_text().splitlines()]
     assert only["index"] == 1
     assert end == {"type": "end", "frames": 1, "dropped": 1}
-
-
-def test_a_client_that_left_is_forgotten(opened: Opened) -> None:
-    port = free_port()
-    receiver = opened(f"jsonl:{port}")
-    client = connect(port)
-    wait_for(receiver, "1 client")
-    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\0\0\0\0\0\0\0")
-    client.close()
-
-    def is_forgotten() -> bool:
-        receiver.send(frame(0))
-        return "0 clients" in receiver.status()
-
-    wait_until(is_forgotten)
-
-
-def test_more_clients_than_are_served_are_refused(opened: Opened) -> None:
-    port = free_port()
-    receiver = opened(f"jsonl:{port}")
-    clients = [connect(port) for _ in range(MOST_CLIENTS)]
-    wait_for(receiver, f"{MOST_CLIENTS} clients")
-    with connect(port) as late:
-        assert late.recv(1) == b""
-    for client in clients:
-        client.close()
 
 
 PROGRAM = """

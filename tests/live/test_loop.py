@@ -165,17 +165,16 @@ def test_click_is_in_the_frame_in_which_it_was_spoken(clock: SimulatedTime) -> N
 
 
 def test_speech_weights_and_the_end_reach_the_receivers() -> None:
-    kept, deaf, solved = Kept(weights=True), Kept(), list[float]()
+    kept, solved = Kept(weights=True), list[float]()
 
     def solve(offsets: np.ndarray) -> np.ndarray:
         solved.append(float(offsets[0, 0]))
         return offsets[:1, 0] / 100
 
-    loop = Loop(fake_model(), Spoken(30.0), [kept, deaf], hearing=[kept], solve=solve, seconds=0.3, report=str)
+    loop = Loop(fake_model(), Spoken(30.0), [kept], hearing=True, solve=solve, seconds=0.3, report=str)
     assert loop.run().speech == pytest.approx(0.3)
     assert sum(len(samples) for samples, _ in kept.speech) == 4800
     assert np.allclose([start for _, start in kept.speech], np.arange(30) * 0.01)
-    assert not deaf.speech
     assert solved == list(range(15))  # once a frame, in order
     weights = [float(frame.weights[0]) for frame in kept.frames if frame.weights is not None]
     assert weights == pytest.approx(np.arange(15) / 100)

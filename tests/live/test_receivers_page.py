@@ -37,5 +37,4 @@ def test_every_receiver_is_described_with_its_usual_place() -> None:
         if not registry.receiver.get(name).__module__.startswith("facediff."):
             continue
         assert f"`{name}" in text, name
-        port = getattr(open_receiver(f"{name}:-" if name == "jsonl" else name), "port", 9009)
-        assert str(port) in text, name
+        assert str(getattr(open_receiver(name), "port", "")) in text, name

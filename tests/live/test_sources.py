@@ -19,10 +19,7 @@ import pytest
 import soundfile
 
 from facediff.errors import FaceDiffError
-from facediff.live.frames import Performance
-from facediff.live.sound import SoundOut
 from facediff.live.sources import Microphone, Pcm, Played, SpeechSource
-from facediff.live.timing import Pacer, SpokenClock
 from tests.fakes.live import FakeSound, device
 from tests.fakes.simulated_time import SimulatedTime
 from tests.fakes.waiting import PATIENCE, wait_until
@@ -130,28 +127,3 @@ def test_microphone_that_is_unplugged_is_an_error(monkeypatch: pytest.MonkeyPatc
     threading.Thread(target=pull, daemon=True).start()
     with pytest.raises(FaceDiffError, match="Webcam"):
         Microphone("Webcam").run(lambda *_: None, threading.Event())
-
-
-def test_speech_is_heard_when_its_frames_are_due(monkeypatch: pytest.MonkeyPatch) -> None:
-    library(monkeypatch, device("Phones", 0, 2, 16_000.0))
-    out, clock, pacer = SoundOut(), SpokenClock(), Pacer(0.1)
-    still = np.zeros((1, 3), np.float32)
-    out.open(Performance(25.0, still, np.zeros((0, 3), np.int32)))
-    start = 100.0
-    monkeypatch.setattr("facediff.live.sound.time", SimpleNamespace(monotonic=lambda: start))
-    played = np.ones((160, 1), np.float32)
-    out._play(played, 160, SimpleNamespace(currentTime=1.0, outputBufferDacTime=1.0), None)
-    assert not played.any()  # nothing is known of the delay yet
-    clock.arrived(0.5, start - 0.5)  # speech began a second ago
-    pacer.ready(start - 0.7, start)  # frames need 0.7 s, and a margin
-    out.follow(clock, pacer)
-    ramp = np.arange(16_000, dtype=np.float32) / 16_000
-    out.hear(ramp, 0.0)
-    out._play(played, 160, SimpleNamespace(currentTime=1.0, outputBufferDacTime=1.1), None)
-    # The block is heard in 0.1 s, 1.1 s after its speech began; less the delay, that is 0.38 s of it.
-    assert played[0, 0] == pytest.approx(1.1 - (pacer.delay or 0.0), abs=1e-3)
-    again = np.zeros((160, 1), np.float32)
-    out._play(again, 160, SimpleNamespace(currentTime=1.01, outputBufferDacTime=1.11), None)
-    assert again[0, 0] == pytest.approx(played[-1, 0] + 1 / 16_000, abs=1e-3)  # without a gap
-    out.close()
-    out.close()

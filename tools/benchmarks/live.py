@@ -4,7 +4,7 @@
 
 An exported model hears speech of the built-in corpus on standard input: the lag is from the moment that the last sample
 of a frame is written until the frame's packet arrives. Packets arrive at sockets of this program: Live Link Face by
-UDP, JSON lines by TCP, the page's frames by WebSocket.
+UDP, the page's frames by WebSocket.
 """
 
 from __future__ import annotations
@@ -65,15 +65,6 @@ def listen_live_link(sock: socket.socket, arrivals: Arrivals) -> None:
         arrivals.add(number - first)
 
 
-def listen_lines(port: int, arrivals: Arrivals) -> None:
-    """JSON lines of a TCP port."""
-    with connected(lambda: socket.create_connection(("127.0.0.1", port))) as connection:
-        for line in connection.makefile():
-            frame = json.loads(line)
-            if frame["type"] == "frame":
-                arrivals.add(frame["index"])
-
-
 def listen_page(port: int, arrivals: Arrivals) -> None:
     """What the page in the browser is sent."""
     from websockets.exceptions import ConnectionClosed
@@ -114,15 +105,15 @@ class Listeners:
     """A listener for each protocol, in threads of their own."""
 
     def __init__(self) -> None:
-        self.arrivals = [Arrivals(name) for name in ("Live Link Face", "JSON lines", "page")]
+        self.arrivals = [Arrivals(name) for name in ("Live Link Face", "page")]
         datagrams = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         datagrams.bind(("127.0.0.1", 0))
-        lines, page = free_port(), free_port()
-        work = (listen_live_link, datagrams), (listen_lines, lines), (listen_page, page)
+        page = free_port()
+        work = (listen_live_link, datagrams), (listen_page, page)
         for (target, source), arrivals in zip(work, self.arrivals, strict=True):
             threading.Thread(target=target, args=(source, arrivals), daemon=True).start()
         link = datagrams.getsockname()[1]
-        self.addresses = [f"livelink://127.0.0.1:{link}", f"jsonl:{lines}", f"browser:{page}"]
+        self.addresses = [f"livelink://127.0.0.1:{link}", f"browser:{page}"]
 
 
 def write_in_real_time(samples: npt.NDArray[np.int16], descriptor: int, times: list[float]) -> None:

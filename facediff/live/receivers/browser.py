@@ -41,9 +41,10 @@ import numpy as np
 
 from facediff.errors import FaceDiffError, counted
 from facediff.live.frames import OPTION, Address, Array, LiveFrame, Performance, Receiver
-from facediff.live.receivers.sending import Outbox, endpoint, listen, log
+from facediff.live.receivers.sending import Outbox, endpoint, log
 from facediff.registry import receiver
-from facediff.utils.server import HEADERS, is_own_page, names_of, require_server
+from facediff.utils.limits import brief
+from facediff.utils.server import HEADERS, is_own_page, listen, names_of, require_server
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
@@ -119,7 +120,13 @@ class Browser(Receiver):
         )
         self._page = "".join(page(performance.subject)).encode()
         self._hosts = names_of(self.host)
-        listening = listen(self.address, self.host, self.port)
+        try:
+            listening = listen(self.host, self.port)
+        except (OSError, ValueError) as error:  # a name that is none, or an address in use
+            raise FaceDiffError(
+                f"{OPTION} {self.name}: port {self.port} of {self.host} cannot be listened at ({brief(error)}); give "
+                f"another port as browser:PORT"
+            ) from error
         # The library logs every connection that is closed in the middle of a message.
         quiet = logging.getLogger("facediff.live.browser")
         quiet.setLevel(logging.CRITICAL)

@@ -23,9 +23,6 @@ Item = TypeVar("Item")
 log = logging.getLogger("facediff.live")
 """Failures that do not end a performance; without a handler, Python writes them to standard error."""
 
-VISITORS = 512
-"""Connections that may wait to be accepted; the system turns away further ones at the same moment."""
-
 THIS_MACHINE = "127.0.0.1"
 
 
@@ -173,40 +170,18 @@ class UdpReceiver(Receiver):
         return "" if self._sending is None else self._sending.status()
 
 
-def listen(address: Address, host: str, port: int) -> socket.socket:
-    """A socket that others connect to."""
-    listening = None
-    try:
-        address_info = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.socket(address_info[0], address_info[1], address_info[2])
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(address_info[4])
-        listening.listen(VISITORS)
-    except (OSError, UnicodeError) as error:
-        if listening is not None:
-            listening.close()
-        reason = getattr(error, "strerror", None) or str(error)
-        raise FaceDiffError(
-            f"{OPTION} {address.text}: port {port} of {host} cannot be listened at ({reason}); give another port as "
-            f"{address.scheme}:PORT"
-        ) from error
-    return listening
-
-
 class Outbox(Generic[Item]):
     """A short queue that a thread of its own empties; where that is too slow, the oldest items are dropped.
 
     Args:
         take: called with each item, in the thread; an :class:`OSError` from it ends the thread.
-        most: items that may wait.
+        capacity: items that may wait.
         name: of the thread.
-        first: an item that is taken first and never dropped.
     """
 
-    def __init__(self, take: Callable[[Item], object], capacity: int, name: str, first: Item | None = None) -> None:
+    def __init__(self, take: Callable[[Item], object], capacity: int, name: str) -> None:
         self._take = take
-        self._first = first
-        self._most = capacity
+        self._capacity = capacity
         self._waiting: deque[Item] = deque()
         self._changed = threading.Condition()
         self._closed = False
@@ -222,21 +197,14 @@ class Outbox(Generic[Item]):
             if self._closed or self.failure is not None:
                 self.dropped += 1
                 return
-            if len(self._waiting) >= self._most:
+            if len(self._waiting) >= self._capacity:
                 self._waiting.popleft()
                 self.dropped += 1
             self._waiting.append(item)
             self._changed.notify()
 
-    def count_dropped(self) -> None:
-        """Count an item that was taken and could not be sent."""
-        with self._changed:
-            self.dropped += 1
-
     def _run(self) -> None:
         try:
-            if self._first is not None:
-                self._take(self._first)
             while True:
                 with self._changed:
                     self._changed.wait_for(lambda: self._waiting or self._closed)
@@ -247,7 +215,7 @@ class Outbox(Generic[Item]):
         except OSError as error:
             with self._changed:
                 self.failure = error
-                self.dropped += len(self._waiting)
+                self.dropped += 1 + len(self._waiting)
                 self._waiting.clear()
 
     def close(self, seconds: float = 1.0) -> None:
