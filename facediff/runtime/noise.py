@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -48,6 +47,10 @@ class NormalStream:
             normal[-BLOCK:] = box_muller(self._uniform(BLOCK))
         return normal.reshape(shape)
 
+    def __call__(self, frames: int, width: int) -> Noise:
+        """The next noise (1, frames, width) of a clip."""
+        return self.draw((frames, width))[None]
+
     def _uniform(self, count: int) -> Noise:
         raw = self._bits.random_raw(count)
         return (raw & 0xFFFFFF).astype(np.float32) * np.float32(2.0**-24)
@@ -62,39 +65,11 @@ def box_muller(uniform: Noise) -> Noise:
 
 
 def stream_of(name: str, seed: int) -> NormalStream:
-    """The stream of random numbers for a name and a seed, as :func:`facediff.models.inference.noise_stream`."""
+    """The stream of random numbers for a name and a seed, as :func:`facediff.models.inference.noise_stream`.
+
+    Its noise of a clip is that of :class:`facediff.models.inference.ClipNoise`.
+    """
     return NormalStream(zlib.crc32(name.encode()) + seed)
-
-
-class NumpyClipNoise:
-    """Unit noise of a whole clip for several seeds, as :class:`facediff.models.inference.ClipNoise` draws it.
-
-    Args:
-        name: of the noise.
-        seeds: one for each sample.
-    """
-
-    def __init__(self, name: str, seeds: Sequence[int]) -> None:
-        self.streams = [stream_of(name, seed) for seed in seeds]
-
-    def __call__(self, frames: int, width: int) -> Noise:
-        """The next noise (seeds, frames, width)."""
-        return np.stack([stream.draw((frames, width)) for stream in self.streams])
-
-
-class SeedNoise:
-    """Unit noise of a clip that depends on the seed alone, as the published methods draw it.
-
-    Args:
-        seed: of the clip.
-    """
-
-    def __init__(self, seed: int) -> None:
-        self.stream = NormalStream(seed)
-
-    def __call__(self, frames: int, width: int) -> Noise:
-        """The next noise (1, frames, width)."""
-        return self.stream.draw((frames, width))[None]
 
 
 class NumpyWindowNoise:
@@ -103,32 +78,29 @@ class NumpyWindowNoise:
     Args:
         name: of the noise.
         window: which window.
-        seeds: one for each sample.
+        seed: of the clip.
     """
 
-    def __init__(self, name: str, window: MotionWindow, seeds: Sequence[int]) -> None:
-        self.window = window
-        self.names = [(f"{name}/{index}", index, new) for index, new in window.origins]
-        self.seeds = list(seeds)
-        self._streams: dict[str, list[NormalStream]] = {}
-        self._drawn = 0
+    def __init__(self, name: str, window: MotionWindow, seed: int) -> None:
+        self.name, self.window, self.seed = name, window, seed
+        self._streams: dict[int, NormalStream] = {}
+        self._drawn = False
 
     def __call__(self, frames: int, width: int) -> Noise:
-        """The next noise (seeds, frames, width); ``frames`` of the window."""
-        unit = np.concatenate([self._draw(name, index, width)[:, new] for name, index, new in self.names], 1)
-        self._drawn += 1
-        return unit
+        """The next noise (1, frames, width); ``frames`` of the window."""
+        unit = np.concatenate([self._draw(index, width)[new] for index, new in self.window.origins])
+        self._drawn = True
+        return unit[None]
 
-    def _draw(self, name: str, index: int, width: int) -> Noise:
-        plan = self.window.plan
+    def _draw(self, index: int, width: int) -> Noise:
+        plan, name = self.window.plan, f"{self.name}/{index}"
         shape = (plan.hop if index else plan.frames, width)
         if not self._drawn:
-            return np.stack([first_draw(name, seed, shape) for seed in self.seeds])
-        if name not in self._streams:
-            self._streams[name] = [stream_of(name, seed) for seed in self.seeds]
-            for stream in self._streams[name]:
-                stream.draw(shape)  # the numbers of the first call
-        return np.stack([stream.draw(shape) for stream in self._streams[name]])
+            return first_draw(name, self.seed, shape)
+        if index not in self._streams:
+            self._streams[index] = stream_of(name, self.seed)
+            self._streams[index].draw(shape)  # the numbers of the first call
+        return self._streams[index].draw(shape)
 
 
 @lru_cache(maxsize=128)

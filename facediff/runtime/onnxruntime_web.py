@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import http.client
 import io
 import os
 import tarfile
 import urllib.request
+import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-from facediff.errors import FaceDiffError
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.checksums import sha256
 from facediff.utils.files import atomic_folder, cache_dir
-from facediff.utils.limits import brief
 
 VERSION = "1.22.0"
 NAME = f"onnxruntime-web {VERSION}"
 REGISTRY = "https://registry.npmjs.org"
 """Where npm packages come from; the variable ``npm_config_registry`` names a mirror, as it does for npm."""
 
-INTEGRITY = "sha512-Ud/+EBo6mhuaQWt/OjaOk0iNWjXqJoeeMFr6xQEERZdIZH2OWpGzuujz7lfuOBjUa6TEE/sc4nb7Da5dNL34fg=="
-"""Hash of the package, as the registry and npm's lock files state it."""
-SIZE = 20_387_966
-"""Its bytes."""
+LARGEST = 1 << 25
+"""Bytes that are read of the package, and of each of its files: 20 MB and 22 MB at most."""
 
 FILES = {
     "ort.wasm.min.mjs": "6ef726f355b791129f7ddf3f62e7877a16b9b777abe87004b8ab306e6b9cf265",
@@ -61,32 +56,8 @@ COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER I
 OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
 """
 
-REMEDY = f"expected the package of `npm pack onnxruntime-web@{VERSION}`, or a folder with its files"
-
-
-@dataclass(frozen=True)
-class Package:
-    """A package of npm by which a download is known."""
-
-    address: str
-    size: int
-    integrity: str
-
-    def check(self, name: str, content: bytes) -> bytes:
-        """The content, if it is the package's."""
-        integrity = f"sha512-{base64.b64encode(hashlib.sha512(content).digest()).decode('ascii')}"
-        if len(content) != self.size or integrity != self.integrity:
-            raise FaceDiffError(f"{name}: is not {NAME} (its size or hash differs); {REMEDY}")
-        return content
-
-
-def package() -> Package:
-    """The pinned package, at the registry that the environment names."""
-    registry = os.environ.get("npm_config_registry") or REGISTRY  # noqa: SIM112 - npm's own name
-    if not registry.startswith(("https://", "http://")):
-        raise FaceDiffError(f"npm_config_registry={registry}: is no address of a registry; expected https://…")
-    address = f"{registry.rstrip('/')}/onnxruntime-web/-/onnxruntime-web-{VERSION}.tgz"
-    return Package(address, SIZE, INTEGRITY)
+REMEDY = f"give the package of `npm pack onnxruntime-web@{VERSION}`, or a folder with its files, with --runtime"
+UNREADABLE = OSError, EOFError, http.client.HTTPException, tarfile.TarError, zlib.error
 
 
 def web_runtime(source: Path | None = None, *, say: Callable[[str], object] = lambda _: None) -> dict[str, Path]:
@@ -97,29 +68,31 @@ def web_runtime(source: Path | None = None, *, say: Callable[[str], object] = la
             cache, and fetched from the npm registry the first time.
         say: called with a sentence before anything is fetched.
     """
-    if source is not None and not source.exists():
-        raise FaceDiffError(f"--runtime {source}: no such file or folder; {REMEDY}")
     if source is not None and source.is_dir():
-        files = _in_folder(source)
-        if files is None:
+        if (files := _in_folder(source)) is None:
             raise FaceDiffError(f"--runtime {source}: holds no {NAME}, or files that were changed; {REMEDY}")
         return files
-    content = b""
-    if source is not None:
-        with source.open("rb") as stream:
-            content = package().check(f"--runtime {source}", stream.read(SIZE + 1))
     cache = cache_dir() / f"onnxruntime-web-{VERSION}"
-    files = _in_folder(cache)
-    if files is not None:
+    if (source is None or source.is_file()) and (files := _in_folder(cache)) is not None:
         return files
-    content = content or _fetch(package(), say)
-    with atomic_folder(cache, replace=True) as staged:
+    registry = os.environ.get("npm_config_registry") or REGISTRY  # noqa: SIM112 - npm's own name
+    address = f"{registry.rstrip('/')}/onnxruntime-web/-/onnxruntime-web-{VERSION}.tgz"
+    if source is None:
+        say(f"fetching {NAME} (20 MB, once) from {address}")
+    where = f"--runtime {source}" if source else address
+    with atomic_folder(cache, replace=True) as staged, damaged(where, REMEDY, *UNREADABLE):
+        if source is not None:
+            content = source.read_bytes()
+        else:
+            if not address.startswith(("https://", "http://")):
+                raise ValueError("no address of a registry")
+            with urllib.request.urlopen(address, timeout=30) as answer:  # noqa: S310 - http or https, see above
+                content = answer.read(LARGEST)
         for name, data in _unpacked(content).items():
             (staged / name).write_bytes(data)
-    files = _in_folder(cache)
-    if files is None:
-        raise FaceDiffError(f"{cache}: cannot be read back as it was written; set FACEDIFF_CACHE to another folder")
-    return files
+        if _in_folder(staged) is None:
+            raise ValueError(f"is not {NAME}")
+    return {name: cache / name for name in FILES}
 
 
 def _in_folder(folder: Path) -> dict[str, Path] | None:
@@ -131,26 +104,13 @@ def _in_folder(folder: Path) -> dict[str, Path] | None:
     return None
 
 
-def _fetch(pinned: Package, say: Callable[[str], object]) -> bytes:
-    say(f"fetching {NAME} ({pinned.size / 1e6:.0f} MB, once) from {pinned.address}")
-    try:
-        with urllib.request.urlopen(pinned.address, timeout=30) as answer:  # noqa: S310 - http or https, see package()
-            content: bytes = answer.read(pinned.size + 1)
-    except (OSError, ValueError, http.client.HTTPException) as error:
-        raise FaceDiffError(
-            f"{pinned.address}: cannot be fetched ({brief(error)}); go online once, or run `npm pack "
-            f"onnxruntime-web@{VERSION}` elsewhere and give the file with --runtime"
-        ) from error
-    return pinned.check(pinned.address, content)
-
-
 def _unpacked(content: bytes) -> dict[str, bytes]:
-    """The files of the package, whose hash has been checked."""
+    """The files of the package."""
     files: dict[str, bytes] = {}
     with tarfile.open(fileobj=io.BytesIO(content), mode="r:gz") as archive:
         for member in archive:
             name = member.name.removeprefix("package/dist/")
             stream = archive.extractfile(member) if name in FILES and member.isreg() else None
             if stream is not None:
-                files[name] = stream.read()
+                files[name] = stream.read(LARGEST)
     return files

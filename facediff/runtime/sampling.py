@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from facediff.errors import OptionError
 from facediff.runtime.graphs import ExportedGraphs
-from facediff.runtime.noise import NumpyClipNoise, NumpyWindowNoise, SeedNoise
+from facediff.runtime.noise import NormalStream, NumpyWindowNoise, stream_of
 from facediff.speech.windows import MotionWindow
 
 Array = npt.NDArray[np.float32]
@@ -77,10 +77,10 @@ def clip_motion(model: ExportedGraphs, speech: WindowSpeech, conditions: Runtime
     if about.generation == "direct":
         motion = model.run("motion", {"features": features, **conditioned(features, conditions)})[0]
     elif about.noise_of == "seed":
-        noise = SeedNoise(conditions.choices.seed)  # such a model predicts no mean, so there is no other noise
+        noise = NormalStream(conditions.choices.seed)  # such a model predicts no mean, so there is no other noise
         motion = SamplerRun(model, conditions, None, 0).run(features, noise, noise)
     else:
-        noises = NumpyClipNoise(NAME, [conditions.choices.seed]), NumpyClipNoise(f"{NAME}/mean", [0])
+        noises = stream_of(NAME, conditions.choices.seed), stream_of(f"{NAME}/mean", 0)
         motion = SamplerRun(model, conditions, None, 0).run(features, *noises)
     if motion.shape[1] == speech.frames:
         return motion
@@ -117,8 +117,8 @@ def window_motion(
     features = np.take(features_of(model, speech, speech.frames), window.encoded, axis=1)
     new, last = slice(window.fixed, window.frames), slice(max(0, window.frames - window.kept), window.frames)
     sampling = SamplerRun(model, conditions, before, window.shared, new)
-    noise = NumpyWindowNoise(NAME, window, [conditions.choices.seed])
-    motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, [0]))
+    noise = NumpyWindowNoise(NAME, window, conditions.choices.seed)
+    motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, 0))
     return motion, [tail[:, last] for tail in sampling.kept]
 
 
