@@ -294,7 +294,7 @@ class ExportOptions(CheckedOptions):
         tracks: for .csv: arkit, or oculus (15 visemes) or vrm (vowels and blinks) as a plain table
         key_tolerance: for weights: leave out keys that a straight line replaces to within so much
         tolerance: for .glb: largest error in mm
-        surface: for .obj, .glb, .usdc and .usda: the .obj or .glb of the animation's mesh, whose texture coordinates,
+        surface: for .glb, .usdc and .usda: the .obj or .glb of the animation's mesh, whose texture coordinates,
             materials and pictures are written (default: the target mesh)
         view: for videos: camera
         size: for videos: height and width in pixels; a .gif has a third of it

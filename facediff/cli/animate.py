@@ -22,7 +22,7 @@ from facediff.cli.parsing import changed
 from facediff.cli.process import confirm_cost, tell
 from facediff.errors import FaceDiffError, refuse_idle
 from facediff.utils import ranges
-from facediff.utils.files import example_recordings, holds_glb
+from facediff.utils.files import example_recordings
 from facediff.utils.hub import check_animating_source, model_or_bundled
 from facediff.utils.option import Option
 
@@ -122,7 +122,7 @@ def animate(
 
     file = Path(f"a{batch.suffix}") if is_batch else Path("a.npy") if stream else output
     check_used(file.suffix, files.changed())
-    is_avatar = target.target_mesh is not None and holds_glb(file)
+    is_avatar = target.target_mesh is not None and file.suffix.lower() == ".glb"
     is_seen = file.suffix == ".html" or is_film(file.suffix) or is_avatar
     refuse_idle(
         "is for videos, pages and avatars: other files have the model's motion alone", still=still and not is_seen

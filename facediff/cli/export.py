@@ -71,8 +71,7 @@ def export(
         inside = [file for file in written.iterdir() if file.is_file()] if written.is_dir() else [written]
         count = f"{len(inside)} files, " if written.is_dir() else ""
         tell(f"{written}: {count}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
-    if output.suffix in FORMATS:  # .fbx is made by another program
-        tell(FORMATS[output.suffix].next_step)
+    tell(FORMATS[output.suffix].next_step)
 
 
 def _may_have_weights(path: Path, lent: bool) -> bool:

@@ -11,7 +11,7 @@ from facediff.cli.options import Map, Output, PageServer, Picture, check_source
 from facediff.cli.parsing import changed
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, refuse_idle
-from facediff.utils.files import check_writable, holds_glb
+from facediff.utils.files import check_writable
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def retarget(
     """
     if output.suffix == ".csv":
         raise FaceDiffError(f"--output {output}: weights need shapes; write .npz, and then use `facediff blendshapes`")
-    both_glb = holds_glb(output) and target_mesh.suffix.lower() == ".glb" and output != target_mesh
+    both_glb = target_mesh.suffix.lower() == output.suffix.lower() == ".glb" and output != target_mesh
     if transfer.add_to_mesh and not both_glb:
         raise FaceDiffError(f"--add-to-mesh: expected two different .glb, not {target_mesh} and {output}; name them so")
     check_source(source)
@@ -96,7 +96,7 @@ def retarget(
 
     check_export(output, ExportOptions())
     dressed = transfer.add_to_mesh or (
-        not transfer.bare_face and holds_glb(output) and has_materials_or_targets(target_mesh)
+        not transfer.bare_face and output.suffix.lower() == ".glb" and has_materials_or_targets(target_mesh)
     )
     carries = transfer.carry or transfer.add_to_mesh or transfer.bare_face
     avatar = None if carries else shapes_to_drive(target_mesh, output)
@@ -235,10 +235,10 @@ def surface_notes(mesh: Path, output: Path, animation: Animation) -> list[str]:
     from facediff.mesh.textures import has_textures, read_textures
 
     is_glb = mesh.suffix.lower() == ".glb"
-    if is_glb and (holds_glb(output) or output.suffix.lower() == ".npy"):
+    if is_glb and output.suffix.lower() in (".glb", ".npy"):
         return []
     textured = has_textures(mesh)
-    if textured and (output.suffix.lower() == ".fbx" or "surface" in FORMATS[output.suffix].uses):
+    if textured and "surface" in FORMATS[output.suffix].uses:
         return list(read_textures(mesh, len(animation.triangles)).losses)
     if is_glb:
         glb = open_glb(mesh)
@@ -250,8 +250,8 @@ def surface_notes(mesh: Path, output: Path, animation: Animation) -> list[str]:
     if not textured:
         return []
     return [
-        f"{output.suffix} has no texture coordinates: those of {mesh.name} are left out; write .obj, .glb "
-        f"or .usdc, or give it to `facediff export` as --surface"
+        f"{output.suffix} has no texture coordinates: those of {mesh.name} are left out; write .glb or "
+        f".usdc, or give it to `facediff export` as --surface"
     ]
 
 

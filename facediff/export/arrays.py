@@ -14,9 +14,6 @@ from facediff.animation.options import ExportOptions
 from facediff.export.format import FileSpace, Format
 from facediff.registry import export_format
 from facediff.spaces.arkit import ARKIT
-from facediff.spaces.files.beat import write_beat
-from facediff.spaces.files.clips import ParameterClip
-from facediff.spaces.layouts import layout
 from facediff.utils.arrays import ArrayWriter
 
 if TYPE_CHECKING:
@@ -71,21 +68,16 @@ class Archive(Format):
         write_archive(path, animation if not options.no_speech else replace(animation, speech=None))
 
 
-class _Weights(Format):
-    """Shared by the files of weights of blendshapes."""
+@export_format.register("csv")
+class BlendshapeWeights(Format):
+    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes, but for the built-in face."""
 
+    next_step = "Unreal: docs/programs.md; `facediff blendshapes` has more options"
     speech = "next to it"
     needs_mesh = False
     needs_shapes = True
     units = "none"
     up_axes = ()
-
-
-@export_format.register("csv")
-class BlendshapeWeights(_Weights):
-    """Weights of blendshapes (ARKit) as Live Link Face writes them; needs --shapes, but for the built-in face."""
-
-    next_step = "Unreal: docs/programs.md; `facediff blendshapes` has more options"
     uses = ("shapes", "tracks", "key_tolerance")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
@@ -99,24 +91,6 @@ class BlendshapeWeights(_Weights):
     def companions(self, path: Path, animation: Animation) -> list[Path]:
         """The .json file."""
         return [path.with_suffix(".json")]
-
-
-@export_format.register("json")
-class BeatWeights(_Weights):
-    """Weights of blendshapes (ARKit) as BEAT writes them; needs --shapes, but for the built-in face."""
-
-    next_step = "programs that play BEAT's faces read it; head and eyes' rotations are not in it"
-    uses = ("shapes",)
-
-    def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write the weights that there are; those that are absent are not written as 0."""
-        (animation,) = animations
-        weights = _arkit_weights(animation, options)
-        unknown = {*weights.absent, *(animation.space.absent if options.shapes is None else ())}
-        columns = [index for index, name in enumerate(weights.names) if name not in unknown]
-        names = tuple(weights.names[index] for index in columns)
-        space = replace(layout("arkit"), channels=names, absent=tuple(name for name in ARKIT if name in unknown))
-        write_beat(path, ParameterClip(path.stem, weights.values[:, columns].astype("f4"), space, weights.frame_rate))
 
 
 def _arkit_weights(animation: Animation, options: ExportOptions) -> Weights:

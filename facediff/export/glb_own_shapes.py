@@ -30,7 +30,6 @@ from facediff.spaces.arkit import ARKIT, arkit_name, plain
 from facediff.spaces.files.csv_files import gaze
 from facediff.spaces.rotations import convert, matrices
 from facediff.spaces.visemes import OCULUS, VRM
-from facediff.utils.files import holds_glb
 
 Array = npt.NDArray[np.float64]
 Kind = Literal["ARKit", "Oculus", "VRM"]
@@ -109,7 +108,7 @@ def own_shapes(target: Path) -> OwnShapes:
 
 def shapes_to_drive(target: Path, output: Path) -> OwnShapes | None:
     """The shapes and bones of an avatar that play a motion in a file; None if one of both has no place for them."""
-    if target.suffix.lower() == ".glb" and holds_glb(output):
+    if target.suffix.lower() == output.suffix.lower() == ".glb":
         with suppress(FaceDiffError):
             return own_shapes(target)
     return None

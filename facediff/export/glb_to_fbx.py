@@ -3,8 +3,6 @@
     blender --background --python glb_to_fbx.py -- hello.glb hello.fbx
     python glb_to_fbx.py hello.glb hello.fbx            # where bpy is installed with pip
 
-`facediff export hello.npz -o hello.fbx` runs it where there is one of them.
-
 ``--key-tolerance 0.01`` leaves out the keys of each curve that a straight line replaces to within so much of a weight.
 The sound next to the .glb is a strip of the scene, which ``--blend hello.blend`` keeps; .fbx has no place for it.
 """
@@ -109,10 +107,6 @@ if __name__ == "__main__":
     parser.add_argument("glb")
     parser.add_argument("fbx")
     parser.add_argument("--key-tolerance", type=float, default=0.0)
-    parser.add_argument("--frame-rate", type=float)
-    parser.add_argument("--frames", type=int)
     parser.add_argument("--blend")
     options = parser.parse_args(arguments)
-    stated = options.frame_rate, options.frames
-    rate, frames = facts_of(options.glb) if None in stated else stated
-    convert(options.glb, options.fbx, options.key_tolerance, rate, frames, options.blend)
+    convert(options.glb, options.fbx, options.key_tolerance, *facts_of(options.glb), options.blend)

@@ -12,12 +12,10 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
-from facediff.export.format import MARK, FileSpace, Format, facts, folder_of, pictures_of, surface_of
-from facediff.mesh.textures import Textures
+from facediff.export.format import FileSpace, Format, facts, folder_of
 from facediff.registry import export_format
 from facediff.utils.plain_files import json_text
 
-LIBRARY = "materials"  # The .mtl in the folder of a sequence of .obj, for all frames
 RECORD = "sequence.json"  # The file that tells a folder of frames from any other folder
 
 
@@ -34,7 +32,7 @@ class MeshSequence(Format):
         space = FileSpace.of(animation, options)
         folder = folder_of(path)
         folder.mkdir()
-        frame_bytes = self.encoder(animation, space, self.dressed(animation, options, folder, path.stem))
+        frame_bytes = self.encoder(animation, space)
         digits = max(4, len(str(len(animation.vertices) - 1)))
         for index, points in enumerate(space.frames(animation)):
             (folder / f"{path.stem}_{index:0{digits}d}{path.suffix}").write_bytes(frame_bytes(points))
@@ -44,14 +42,8 @@ class MeshSequence(Format):
             record["speech"] = options.speech_file
         (folder / RECORD).write_bytes(json_text(path, record).encode())
 
-    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> Textures | None:
-        """The frames' textures; files that they share are written to the folder."""
-        return None
-
     @abstractmethod
-    def encoder(
-        self, animation: Animation, space: FileSpace, surface: Textures | None = None
-    ) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A function that gives a file's bytes from a frame's positions (V, 3)."""
 
 
@@ -59,46 +51,11 @@ class MeshSequence(Format):
 class ObjSequence(MeshSequence):
     """A folder with an .obj mesh for every frame."""
 
-    uses = ("surface",)
-
-    def dressed(self, animation: Animation, options: ExportOptions, folder: Path, stem: str) -> Textures | None:
-        """The texture coordinates; the materials and their pictures are written once for all frames."""
-        surface = surface_of(animation, options)
-        if surface is not None:
-            self.write_materials(surface, folder, stem, LIBRARY)
-        return surface
-
-    @staticmethod
-    def write_materials(surface: Textures, folder: Path, stem: str, library: str) -> None:
-        """The material file, and pictures with names that begin with the stem."""
-        pictures, lines = pictures_of(surface, stem), [f"# {MARK.decode()}"]
-        for number, material in enumerate(surface.materials):
-            lines += [f"newmtl {material.name}", "Kd {:g} {:g} {:g}".format(*material.colour)]
-            if number in pictures:
-                name, data = pictures[number]
-                (folder / name).write_bytes(data)
-                lines.append(f"map_Kd {name}")
-        (folder / f"{library}.mtl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-    def encoder(
-        self, animation: Animation, space: FileSpace, surface: Textures | None = None, library: str = LIBRARY
-    ) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """Vertices with nine digits, which give back every float32; colours follow them as sRGB from 0 to 1."""
         comment = f"# {_comment(animation, space)}\n"
         # Triangles are counted from 1 and keep the animation's order and winding.
-        triangles = (animation.triangles + 1).tolist()
-        if surface is None:
-            faces = "".join(f"f {a} {b} {c}\n" for a, b, c in triangles).encode()
-        else:
-            comment += f"mtllib {library}.mtl\n"
-            lines, last = [f"vt {u:.9g} {v:.9g}\n" for u, v in surface.uvs.tolist()], -1
-            corners = (surface.corners + 1).tolist()
-            for (a, b, c), (p, q, r), number in zip(triangles, corners, surface.of_face.tolist(), strict=True):
-                if number != last:
-                    lines.append(f"usemtl {surface.materials[number].name}\n")
-                    last = number
-                lines.append(f"f {a}/{p} {b}/{q} {c}/{r}\n")
-            faces = "".join(lines).encode()
+        faces = "".join(f"f {a} {b} {c}\n" for a, b, c in (animation.triangles + 1).tolist()).encode()
 
         def encode(points: npt.NDArray[np.float32]) -> bytes:
             if animation.colours is None:
@@ -115,9 +72,7 @@ class ObjSequence(MeshSequence):
 class PlySequence(MeshSequence):
     """A folder with a binary .ply mesh for every frame."""
 
-    def encoder(
-        self, animation: Animation, space: FileSpace, surface: Textures | None = None
-    ) -> Callable[[npt.NDArray[np.float32]], bytes]:
+    def encoder(self, animation: Animation, space: FileSpace) -> Callable[[npt.NDArray[np.float32]], bytes]:
         """A header, little-endian vertices with sRGB bytes, and triangles."""
         colours = animation.colours
         names = () if colours is None else ("red", "green", "blue")
@@ -154,7 +109,6 @@ class PointCache(Format):
     next_step = "Blender: import the .obj, add the modifier Mesh Cache and choose this file: docs/programs.md"
     speech = "next to it"
     needs_mesh = False
-    uses = ("surface",)
     dtype: str
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
@@ -166,10 +120,7 @@ class PointCache(Format):
             for points in space.frames(animation):
                 stream.write(points.astype(self.dtype).tobytes())
         for mesh in self.companions(path, animation):
-            form, surface = ObjSequence(), surface_of(animation, options)
-            if surface is not None:
-                form.write_materials(surface, path.parent, path.stem, path.stem)
-            mesh.write_bytes(form.encoder(animation, space, surface, path.stem)(space.place(animation.template)))
+            mesh.write_bytes(ObjSequence().encoder(animation, space)(space.place(animation.template)))
 
     @abstractmethod
     def header(self, animation: Animation) -> bytes:

@@ -6,14 +6,12 @@ import importlib.util
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from facediff import registry
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, MissingExtraError, OptionError, check_known
-from facediff.export.fbx import refuse_without_blender, write_fbx
 from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
 from facediff.mesh.textures import PICTURE_SUFFIXES, has_textures
@@ -61,8 +59,7 @@ def write_animations(
         animations: at least one.
         options: the user's; the defaults if None.
         into: the file of the animations' mesh: to the copy of a .glb each animation is added where that is a .glb as
-            well, else its texture coordinates and materials, or an .obj's, are written where the format has them;
-            surfaces alone are written if None.
+            well, else its texture coordinates and materials, or an .obj's, are written to .glb and USD.
         own_shapes: drive the shapes and bones that this .glb has, instead of adding shapes that move as the animation.
         z_up: whether z points up in that file. Formats that hold either axis then have z up too, unless the options
             choose one, so that the output fits the file.
@@ -76,8 +73,6 @@ def write_animations(
     """
     options = options or ExportOptions()
     check_export(path, options, len(animations), weights=seeks_weights(path, options) and have_weights(animations))
-    if path.suffix.lower() == ".fbx":
-        return _write_fbx(path, animations, options, into, own_shapes)
     form = FORMATS[path.suffix]
     if z_up and options.up is None and "z" in form.up_axes:
         options = replace(options, up="z")
@@ -118,29 +113,12 @@ def write_animations(
         written = sorted(hidden.iterdir())
         for file in written:
             goal = path.with_name(file.name)
-            if file.suffix in (*PICTURE_SUFFIXES, ".mtl") and file not in [hidden / target.name for target in targets]:
-                check_free(goal)  # a material and its picture have not been named by the user
+            if file.suffix in PICTURE_SUFFIXES and file not in [hidden / target.name for target in targets]:
+                check_free(goal)  # the picture of a material has not been named by the user
         for file in written:
             put_in_place(file, path.with_name(file.name))
     first = [(folder_of(target) if form.is_folder else target).name for target in targets]
     return [path.with_name(name) for name in [*first, *(file.name for file in written if file.name not in first)]]
-
-
-def _write_fbx(
-    path: Path, animations: Sequence[Animation], options: ExportOptions, into: Path | None, own_shapes: bool
-) -> list[Path]:
-    """Files that Blender makes of .glb files; arguments as in :func:`write_animations`."""
-    form = FORMATS[".glb"]
-    names = _targets(path, form, len(animations))
-    sounds = [_speech_file(name, form, one, options) for name, one in zip(names, animations, strict=True)]
-    glb = partial(write_animations, options=options, into=into, own_shapes=own_shapes)
-    files: list[Path] = []
-    with scratch_folder(path) as hidden:
-        for name, animation, sound in zip(names, animations, sounds, strict=True):
-            files += write_fbx(name, hidden, animation, sound, partial(glb, animations=[animation]))
-        for file in files:
-            put_in_place(file, path.with_name(file.name))
-    return [path.with_name(file.name) for file in files]
 
 
 def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, weights: bool = False) -> None:
@@ -153,11 +131,7 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         weights: whether the animations have, or may have, weights of ARKit's shapes by themselves.
     """
     suffix = path.suffix
-    if suffix.lower() == ".fbx":
-        refuse_without_blender(path)
-        check_writable(path)
-        path, suffix = path.with_suffix(".glb"), ".glb"
-    check_known(path, "format", [suffix], [*FORMATS, ".fbx"])
+    check_known(path, "format", [suffix], FORMATS)
     form = FORMATS[suffix]
     metres = 1.0 if options.output_unit is None else metres_per_unit(options.output_unit)
     reason = ""
@@ -180,8 +154,6 @@ def check_export(path: Path, options: ExportOptions, n_animations: int = 1, *, w
         raise MissingExtraError(*form.requires, f"writing {suffix}")
     for target in _targets(path, form, n_animations):
         check_writable(target)
-        if suffix == ".json" and target.exists() and target.stat().st_size and is_free(target):
-            raise FaceDiffError(f"{target}: describes {target.with_suffix('.csv').name}; choose another -o")
         if form.is_folder:
             check_free(folder_of(target))
 
@@ -211,7 +183,7 @@ def check_used(suffix: str, option_names: Collection[str]) -> None:
         suffix: of the file.
         option_names: names of the options that were given, as ``facediff export`` calls them.
     """
-    form = FORMATS.get(".glb" if suffix.lower() == ".fbx" else suffix)  # .fbx is made of a .glb
+    form = FORMATS.get(suffix)
     if form is None:
         return
     problems: dict[str, str] = {}

@@ -20,7 +20,6 @@ from facediff.errors import FaceDiffError, damaged, needs_extra
 from facediff.mesh.glb import Glb, attributes, open_glb, whole_number
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
-from facediff.utils.files import holds_glb
 from facediff.utils.limits import in_range
 
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
@@ -101,7 +100,7 @@ def has_textures(path: Path) -> bool:
 
 def hands_on_textures(path: Path, output: Path) -> bool:
     """Whether an output gets a mesh file's textures without being a copy of it: a .glb's own go into its copy alone."""
-    return not (path.suffix.lower() == ".glb" and holds_glb(output)) and has_textures(path)
+    return not (path.suffix.lower() == output.suffix.lower() == ".glb") and has_textures(path)
 
 
 def read_textures(path: Path, n_triangles: int) -> Textures:

@@ -41,7 +41,7 @@ from facediff.pipelines.stages import (
 )
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, MouthAtRest, read_gate
 from facediff.utils import SAMPLE_RATE, hints, ranges
-from facediff.utils.files import holds_glb, scratch_folder, valid_text
+from facediff.utils.files import scratch_folder, valid_text
 from facediff.utils.hub import is_audio2face
 from facediff.utils.progress import track
 from facediff.utils.ranges import USUAL_GAZE, USUAL_SWAY
@@ -301,7 +301,7 @@ class AnimationPipeline(ABC):
 
         # A surface alone would lose materials, skins and targets of a .glb, coordinates and pictures.
         target = Path(self.options.target_mesh or "")
-        is_dressed = holds_glb(output) and export.output_unit is None and self._target_has_materials
+        is_dressed = output.suffix.lower() == ".glb" and export.output_unit is None and self._target_has_materials
         own_shapes = self.options.own_shapes
         into = target if own_shapes or is_dressed or hands_on_textures(target, output) else None
         with self.animations(recording, output, seed=seed) as animations:

@@ -234,16 +234,6 @@ def _refuse_unwritable(path: Path, target: Path) -> None:
         os.close(os.open(target, os.O_WRONLY))  # changes nothing; fails where permissions or the disk forbid to write
 
 
-def holds_glb(path: Path) -> bool:
-    """Whether a file is a .glb, or .fbx, which is made of one.
-
-    Example:
-        >>> [holds_glb(Path(name)) for name in ("a.glb", "a.FBX", "a.obj")]
-        [True, True, False]
-    """
-    return path.suffix.lower() in (".glb", ".fbx")
-
-
 def check_writable(path: Path) -> None:
     """Make sure, before any work is done, that a file can be written; changes nothing and leaves nothing behind."""
     with _writing(path):

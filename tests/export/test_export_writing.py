@@ -24,7 +24,7 @@ OWN = [".glb", ".usdc", ".usda", ".obj", ".ply", ".pc2", ".mdd", *VIDEOS, ".npz"
 
 
 def test_formats_are_as_promised() -> None:
-    assert {*OWN, ".html", ".csv", ".json"} == set(FORMATS)
+    assert {*OWN, ".html", ".csv"} == set(FORMATS)
     assert {suffix for suffix, made in FORMATS.items() if made.holds_several} == {*VIDEOS, ".html"}
     assert {suffix for suffix, made in FORMATS.items() if made.speech == "in the file"} == {
         *VIDEOS[:2],
@@ -35,7 +35,6 @@ def test_formats_are_as_promised() -> None:
         ".pc2",
         ".mdd",
         ".csv",
-        ".json",
         ".npz",
         ".npy",
     }
@@ -55,7 +54,6 @@ def test_formats_are_as_promised() -> None:
         ("a.mp4", {"up": "y"}, [".mp4", "no axes"]),
         ("a.obj", {"output_unit": "parsec"}, ['unit "parsec"']),
         ("a.csv", {}, ["a.csv", "shapes"]),
-        ("a.json", {}, ["a.json", "shapes"]),
         ("a.csv", {"shapes": Path("nowhere")}, ["nowhere: no such folder or file"]),
         ("file/a.glb", {}, ["cannot be written"]),
         ("folder.glb", {}, ["is a folder"]),
@@ -224,8 +222,6 @@ def test_csv_holds_weights_solved_for_the_shapes(make_animation: Callable[..., A
     animation = make_animation(vertices=(rest + opened[:, None, None] * shapes["jawOpen"]).astype(np.float32))
     written = write_animations(tmp_path / "a.csv", [animation], ExportOptions(shapes=tmp_path / "shapes"))
     assert [path.name for path in written] == ["a.csv", "a.json", "a.wav"]
-    with pytest.raises(FaceDiffError, match=r"a\.json: describes a\.csv"):
-        write_animations(tmp_path / "a.json", [animation], ExportOptions(shapes=tmp_path / "shapes"))
     table = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     np.testing.assert_allclose(table["JawOpen"], opened, atol=0.03)
     assert np.abs(table["MouthFunnel"]).max() < 0.03

@@ -106,21 +106,6 @@ def test_vertices_have_the_colours_of_pictures_in_the_check_of_a_transfer(source
     assert with_pictures(animation, source.with_suffix(".mtl")) is animation
 
 
-def test_obj_frames_share_materials_and_may_be_written_again(
-    tmp_path: Path, source: Path, animation: Animation, truth: np.ndarray
-) -> None:
-    for _ in range(2):
-        folder, *_ = write_animations(tmp_path / "a.obj", [animation], ExportOptions(surface=source))
-    scene = trimesh.load(folder / "a_0000.obj", process=False, split_object=False, group_material=True, force="scene")
-    parts = parts_of(scene)
-    assert both(parts) == pytest.approx(truth, abs=1e-5)
-    again = read_textures(folder / "a_0002.obj", 12)
-    assert [material.name for material in again.materials] == ["skin", "cloth"]
-    assert again.materials[1].colour == (0.2, 0.4, 0.6)
-    assert np.array_equal(read_mesh(folder / "a_0002.obj").vertices, animation.vertices[2])
-    assert np.array_equal(again.uvs[again.corners], read_textures(source, 12).uvs[read_textures(source, 12).corners])
-
-
 def test_usd_has_coordinates_materials_and_the_picture(
     tmp_path: Path, source: Path, animation: Animation, truth: np.ndarray
 ) -> None:
@@ -145,21 +130,6 @@ def test_usd_has_coordinates_materials_and_the_picture(
     (tmp_path / "a_0.png").write_bytes(b"mine")
     with pytest.raises(FaceDiffError, match=r"a_0\.png"):
         write_animations(tmp_path / "a.usda", [animation], into=source)
-
-
-def test_the_mesh_of_a_point_cache_has_coordinates_materials_and_pictures(
-    tmp_path: Path, source: Path, animation: Animation
-) -> None:
-    for _ in range(2):
-        written = write_animations(tmp_path / "a.mdd", [animation], into=source)
-    assert [path.name for path in written] == ["a.mdd", "a.mtl", "a.obj", "a_0.png"]
-    again, before = (read_textures(path, 12) for path in (tmp_path / "a.obj", source))
-    assert np.array_equal(again.uvs[again.corners], before.uvs[before.corners])
-    assert [material.picture for material in again.materials] == [tmp_path / "a_0.png", None]
-    assert np.array_equal(read_mesh(tmp_path / "a.obj").vertices, animation.template)
-    (tmp_path / "a.mtl").write_text("newmtl mine")
-    with pytest.raises(FaceDiffError, match=r"a\.mtl"):
-        write_animations(tmp_path / "a.mdd", [animation], into=source)
 
 
 @pytest.mark.parametrize("form", ["PNG", "JPEG"])
@@ -238,7 +208,7 @@ def avatar(tmp_path: Path) -> Path:
     return tmp_path / "avatar.glb"
 
 
-@pytest.mark.parametrize("name", ["a.obj", "a.usda", "a.mdd", "a.glb"])
+@pytest.mark.parametrize("name", ["a.usda", "a.glb"])
 def test_textures_of_an_avatar_are_where_its_vertices_are(tmp_path: Path, avatar: Path, name: str) -> None:
     mesh = read_mesh(avatar)
     rest = mesh.vertices.astype(np.float32)
@@ -259,16 +229,11 @@ def test_textures_of_an_avatar_are_where_its_vertices_are(tmp_path: Path, avatar
         pytest.importorskip("pxr")
     options = ExportOptions(surface=avatar if name == "a.glb" else None)
     written = write_animations(tmp_path / name, [animation], options, into=None if name == "a.glb" else avatar)
-    folder = written[0] if name == "a.obj" else tmp_path
     if name == "a.glb":
         scene = trimesh.load(written[0], process=False)
         uvs = parts_of(scene)["HairMaterial"].visual.uv
         assert {tuple(row) for row in uvs.round(4)} <= {tuple(row) for row in own.uvs.round(4)}
         return
-    (picture,) = folder.glob("a_0.png")
+    (picture,) = tmp_path.glob("a_0.png")
     data, _, _ = own.materials[names.index("TeethMaterial")].picture_bytes() or (b"", "", "")
     assert (np.asarray(Image.open(picture)) == np.asarray(Image.open(io.BytesIO(data)))).all()
-    if name != "a.usda":
-        again = read_textures(folder / "a_0000.obj" if name == "a.obj" else tmp_path / "a.obj", len(mesh.faces))
-        assert again.uvs[again.corners] == pytest.approx(own.uvs[own.corners], abs=1e-6)
-        assert [material.name for material in again.materials] == names
