@@ -134,18 +134,13 @@ def save(view: Workspace) -> str:
         FaceDiffError: if there is no key or no answer, or the server refuses.
     """
     os.environ.setdefault("WANDB_SILENT", "true")
-    from facediff.cli.lightning_cli import why_offline
-
     try:
-        reason = why_offline()
-        if reason is None:
-            return str(view.save().url)
+        return str(view.save().url)
     except Exception as error:  # wandb raises errors of its own, of its transport and of requests
-        reason = f"wandb refuses ({error})"
-    raise FaceDiffError(
-        f"the dashboard of {view.entity}/{view.project} was not saved: {reason}; --output FILE writes its JSON without "
-        f"a network"
-    )
+        raise FaceDiffError(
+            f"the dashboard of {view.entity}/{view.project} was not saved: wandb refuses ({error}); --output FILE "
+            f"writes its JSON without a network"
+        ) from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
-from dataclasses import dataclass
 from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
 import lightning
-import numpy as np
-import numpy.typing as npt
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
-from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torch.optim import Optimizer
 
 from facediff import registry
-from facediff.data import SpeechMotionDataModule, collate
-from facediff.errors import FaceDiffError
+from facediff.data import SpeechMotionDataModule
 from facediff.models import AnimationModel
-from facediff.utils import SAMPLE_RATE
 from facediff.utils.checksums import sha256
 from facediff.utils.hints import checks_arguments
 from facediff.utils.hub import model_hash, split_face
 from facediff.utils.provenance import Provenance, recipe_of
 from facediff.version import __version__
-
-PICTURE_SIZE = 320  # Pixels of a picture's sides
 
 
 class RunDescription(Callback):
@@ -176,99 +168,3 @@ def gradients_by_part(module: LightningModule) -> dict[str, list[Tensor]]:
         if gradient is not None:
             parts.setdefault(path[shared], []).append(gradient)
     return parts
-
-
-# Sound and error pictures of single test clips, for the table of sequences.
-
-
-@dataclass(frozen=True)
-class ClipErrors:
-    """The errors of a clip's motion by vertex."""
-
-    split: str
-    clip: str
-    identity: str
-    condition: str  # the training identity that an unseen speaker's clip was conditioned on; empty for none
-    audio: npt.NDArray[np.float32]  # its speech (S,), 16 kHz
-    # Distance between prediction and truth (V,), mean over the frames, in the corpus's unit.
-    errors: npt.NDArray[np.float32]
-
-
-def lip_error(scores: Container[str]) -> str:
-    """The name of the lips' error among scores, or of all vertices' error by protocols without lips."""
-    return "lve" if "lve" in scores else "mve"
-
-
-def worst_clips(rows: list[dict[str, Any]], count: int) -> list[dict[str, Any]]:
-    """The rows of the model's worst clips by :func:`lip_error`, the worst first; equal ones in the rows' order."""
-    mine = [row for row in rows if row["method"] == "model"]
-    return sorted(mine, key=lambda row: -float(row[lip_error(row)]))[:count]
-
-
-@torch.inference_mode()
-def measure_clips(trainer: Trainer, model: AnimationModel, rows: list[dict[str, Any]]) -> list[ClipErrors]:
-    """Predict some test clips again, one after the other, and measure their errors per vertex.
-
-    A clip's noise follows from its name, so this is the motion that the test has scored. Predicting it again costs less
-    than keeping the motion of every clip that might be among the worst, and lets one process show the worst of all.
-    """
-    data: SpeechMotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
-    datasets = {split: data.dataset(split) for split in {row["split"] for row in rows}}
-    measured = []
-    for row in rows:
-        dataset = datasets[row["split"]]
-        sample = dataset[[clip.name for clip in dataset.clips].index(row["clip"])]
-        batch = dict(model.views_of_clips(collate([sample]).to(model.device)))[row["identity"]]
-        with trainer.precision_plugin.forward_context():
-            motion = model.generate(batch, seed=0)
-        off = model.assets.to_scored(motion[0].float() - batch.motion[0], sample.identity_name)
-        errors = off.norm(dim=-1).mean(dim=0)
-        names = (row["split"], sample.name, sample.identity_name, row["identity"])
-        measured.append(ClipErrors(*names, sample.audio.numpy(), errors.cpu().numpy()))
-    return measured
-
-
-def draw_errors(model: AnimationModel, clips: list[ClipErrors]) -> list[npt.NDArray[np.uint8] | None]:
-    """The errors as colours on each clip's template, all on one scale from zero to :func:`highest_error`.
-
-    Returns:
-        pictures (height, width, 3), sRGB; None in place of those that cannot be drawn, with a warning that gives the
-        reason: the corpus has no faces, the packages for drawing are missing, or an error is not finite.
-    """
-    assets = model.assets.scored
-    if assets.faces is None:
-        rank_zero_warn(f"test/sequences has no error pictures: the corpus {assets.corpus} has no mesh file")
-        return [None] * len(clips)
-    try:
-        from facediff.render import Renderer
-        from facediff.render.panels import heat_colours
-
-        pictures: list[npt.NDArray[np.uint8] | None] = []
-        for clip in clips:
-            template = assets.template(clip.identity).numpy()
-            renderer = Renderer(assets.faces.numpy(), template=template, size=PICTURE_SIZE)
-            pictures.append(renderer.render(template, colours=heat_colours(clip.errors, highest_error(clips))))
-        return pictures
-    except FaceDiffError as error:
-        # The scores are written by now; the rest of the test's report must not fail for a picture.
-        rank_zero_warn(f"test/sequences has no error pictures: {error}")
-        return [None] * len(clips)
-
-
-def highest_error(clips: list[ClipErrors]) -> float:
-    """The largest error of any clip at any vertex: the end of the colour scale; above zero."""
-    return max([*(float(clip.errors.max()) for clip in clips), 1e-12])
-
-
-def wandb_media(model: AnimationModel, clips: list[ClipErrors]) -> dict[tuple[str, str, str], list[Any]]:
-    """``wandb.Audio`` and ``wandb.Image`` (or None) of every clip, by split, name and condition."""
-    import wandb
-
-    scale = f"mean error of each vertex, 0 to {highest_error(clips):.3g} {model.assets.unit}" if clips else ""
-    return {
-        (clip.split, clip.clip, clip.condition): [
-            wandb.Audio(clip.audio, sample_rate=SAMPLE_RATE, caption=clip.clip),
-            None if picture is None else wandb.Image(picture, caption=f"{clip.clip}: {scale}"),
-        ]
-        for clip, picture in zip(clips, draw_errors(model, clips), strict=True)
-    }

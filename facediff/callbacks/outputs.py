@@ -6,14 +6,14 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter, ModelCheckpoint
 from lightning.pytorch.loggers import WandbLogger
 
-from facediff.callbacks.dashboard import measure_clips, provenance_of, wandb_media, worst_clips
+from facediff.callbacks.dashboard import provenance_of
 from facediff.data import SpeechMotionDataModule
 from facediff.errors import counted, note, number
 from facediff.models import AnimationModel
@@ -22,7 +22,6 @@ from facediff.models.inference import Prediction
 from facediff.utils.files import atomic
 from facediff.utils.hints import checks_arguments
 from facediff.utils.plain_files import write_json, write_rows
-from facediff.utils.ranges import Range
 from facediff.utils.text_tables import format_table
 
 METHOD_NAMES = {name: label.format(model="model") for name, label in METHODS.items()}
@@ -73,17 +72,8 @@ class ScoreTable(Callback):
     ``model.score_by``), ``test_sequences.csv`` (a row per clip and method), ``test_report.json`` (all of it for
     programs, such as ``facediff benchmark``) and ``provenance.json``, the training run: its seed, components and the
     checkpoint's SHA-256, which are also in every row of the scores. Weights & Biases gets the table of sequences as
-    ``test/sequences``, with sound and a picture of the errors for the worst clips, and the protocol's definition in the
-    run's config.
-
-    Args:
-        media_clips: how many clips get sound and picture, the worst by LVE of all processes. They are predicted once
-            more, by the first process alone, one at a time; nothing is kept in memory during the test.
+    ``test/sequences``, and the protocol's definition in the run's config.
     """
-
-    @checks_arguments
-    def __init__(self, media_clips: Annotated[int, Range(0, 10_000)] = 8) -> None:
-        self.media_clips = media_clips
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say how much is generated where that takes days: a paper's own test may."""
@@ -143,32 +133,12 @@ class ScoreTable(Callback):
             }
             write_json(Path(folder) / "test_report.json", report)
         sys.stdout.flush()
-        loggers = [logger for logger in trainer.loggers if isinstance(logger, WandbLogger)]
-        if loggers:
-            worst = worst_clips(sequences, self.media_clips)
-            media = wandb_media(pl_module, measure_clips(trainer, pl_module, worst))
-            for logger in loggers:
-                log_sequences(logger, sequences, evaluation.describe(), media)
-
-
-def log_sequences(
-    logger: WandbLogger, sequences: list[dict[str, Any]], definition: str, media: dict[tuple[str, str, str], list[Any]]
-) -> None:
-    """Give Weights & Biases the table of sequences, a row per clip and method, and the protocol's definition.
-
-    Media are sound and picture by split, clip and identity; the model's rows that have them come first, in this order.
-    """
-    columns = list(sequences[0])
-    ranks = {key: rank for rank, key in enumerate(media)}
-    data: list[tuple[int, list[Any]]] = []
-    for row in sequences:
-        key = (row["split"], row["clip"], row["identity"])
-        with_media = row["method"] == "model" and key in media
-        values = [*(row[name] for name in columns), *(media[key] if with_media else (None, None))]
-        data.append((ranks[key] if with_media else len(ranks), values))
-    data.sort(key=lambda entry: entry[0])  # stable: rows without media keep their order
-    logger.log_table("test/sequences", columns=[*columns, "audio", "error"], data=[values for _, values in data])
-    logger.experiment.config.update({"protocol_definition": definition}, allow_val_change=True)
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):
+                rows_of_values = [list(row.values()) for row in sequences]
+                logger.log_table("test/sequences", columns=list(sequences[0]), data=rows_of_values)
+                config = {"protocol_definition": evaluation.describe()}
+                logger.experiment.config.update(config, allow_val_change=True)
 
 
 def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool, metrics: Sequence[str] = ()) -> str:

@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
-import urllib.error
-import urllib.request
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -40,7 +37,7 @@ from facediff.cli.process import chain
 from facediff.cli.trainer_options import IDLE_WARNINGS, check_trainer, without_warnings
 from facediff.cli.words import explain
 from facediff.data import SpeechMotionDataModule
-from facediff.errors import ArgumentError, FaceDiffError, needs_extra
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.hyperparameters import plain
 from facediff.models import AnimationModel
 from facediff.models.checkpoint import read_checkpoint
@@ -211,12 +208,11 @@ class FaceDiffCLI(LightningCLI):
         return [entry for entry in (stated if isinstance(stated, list) else [stated]) if hasattr(entry, "class_path")]
 
     def before_instantiate_classes(self) -> None:
-        """Check the experiment's name and the corpus, and decide whether wandb uploads before anything starts it."""
+        """Check the experiment's name, the trainer and the corpus."""
         name = self.options.name
         if not name or not name.isprintable() or os.path.isabs(name) or ".." in Path(name).parts:
             raise ArgumentError({"name": name}, "expected the name of a folder for the runs", located=True)
         check_trainer(self.options.trainer, self.command)
-        settle_wandb_mode(self.options.trainer)
         refuse_missing_corpus(self.options.data)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:  # noqa: ANN401
@@ -307,7 +303,7 @@ class ParsedCLI(FaceDiffCLI):
         self.config["seed_everything"] = False
 
     def before_instantiate_classes(self) -> None:
-        """Leave wandb alone."""
+        """Check nothing."""
 
     def instantiate_classes(self) -> None:
         """Make nothing."""
@@ -352,89 +348,3 @@ class RunConfig(SaveConfigCallback):
             if isinstance(logger, WandbLogger):
                 config = yaml.safe_load(self.parser.dump(self.config, skip_none=False))
                 logger.log_hyperparams({"config": config})
-
-
-# Weights & Biases without questions and waiting: offline where there is no key or the server does not answer.
-
-PATIENCE = 5.0
-"""Seconds that the server has for its first answer."""
-
-
-def settle_wandb_mode(trainer: Mapping[str, Any]) -> None:
-    """Let a run that logs to Weights & Biases record offline where it could not upload.
-
-    Without a key wandb asks a question and waits for an answer, and without a network it waits for a minute and a half
-    and then fails. Here one line says why the run is offline and how it is uploaded later. A mode that is set by
-    ``WANDB_MODE`` or ``offline: true`` stays.
-    """
-    from lightning.pytorch.utilities import rank_zero_only
-
-    options = logger_options(trainer, "WandbLogger")
-    if options is None or getattr(rank_zero_only, "rank", None):  # other processes of a run log nothing
-        return
-    with needs_extra("wandb", "wandb", "logging to Weights & Biases"):
-        import wandb
-    if os.environ.get("WANDB_MODE") or options.get("offline") or wandb.run is not None:
-        return
-    silent = os.environ.get("WANDB_SILENT")
-    os.environ.setdefault("WANDB_SILENT", "true")  # else a login is announced, for which wandb asks the server
-    try:
-        reason = why_offline()
-    except (wandb.Error, ValueError) as error:
-        raise FaceDiffError(
-            f"wandb: {error}; correct the key (`wandb login --relogin`), or set WANDB_MODE=offline"
-        ) from error
-    wandb.teardown()  # the logger then reads the environment again
-    if reason is None:
-        if silent is None:
-            del os.environ["WANDB_SILENT"]  # the run's address is worth a line
-        return
-    os.environ["WANDB_MODE"] = "offline"
-    folder = options.get("save_dir") or options.get("dir") or "."
-    print(
-        f"wandb: {reason}: the run is recorded offline; upload it later with `wandb sync {folder}/wandb/offline-run-*`",
-        file=sys.stderr,
-        flush=True,
-    )
-
-
-def logger_options(trainer: Mapping[str, Any], kind: str) -> Mapping[str, Any] | None:
-    """Options of the first logger of this class name; None if there is none."""
-    loggers = trainer.get("logger")
-    for logger in loggers if isinstance(loggers, list) else [loggers]:
-        if str(getattr(logger, "class_path", "")).endswith(kind):
-            return dict(getattr(logger, "init_args", None) or {})
-    return None
-
-
-def why_offline() -> str | None:
-    """Why a run cannot be uploaded: no key, or no answer; None if it can."""
-    import wandb
-
-    if not wandb.login(prompt=False, verify=False):
-        return "no API key found (`wandb login`, WANDB_API_KEY)"
-    address = str(wandb.setup().settings.base_url)
-    return None if answers(address) else f"{address} does not answer"
-
-
-def answers(address: str, patience: float = PATIENCE) -> bool:
-    """Whether a web server answers, with anything but a server error; proxies of the environment are used.
-
-    In a thread of its own, since looking up a name may take longer than any time limit of the connection.
-    """
-    answered = threading.Event()
-
-    def ask() -> None:
-        try:
-            urllib.request.urlopen(address, timeout=patience).close()  # noqa: S310 (the user's own setting)
-        except urllib.error.HTTPError as error:
-            if error.code >= 500:  # a gateway without its server; "not found" is an answer
-                return
-        except (OSError, ValueError):
-            return
-        answered.set()
-
-    thread = threading.Thread(target=ask, daemon=True)
-    thread.start()
-    thread.join(patience)
-    return answered.is_set()

@@ -40,7 +40,7 @@ def test_what_a_test_generates_is_told(
 
     monkeypatch.setattr(DualPathDiffusion, "generate", counting)
     monkeypatch.setattr(outputs, "MANY_STEPS", 0)
-    trainer = make_trainer(callbacks=[outputs.ScoreTable(media_clips=0)])
+    trainer = make_trainer(callbacks=[outputs.ScoreTable()])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", Note)
         trainer.test(model, datamodule=tiny, verbose=False)
@@ -67,7 +67,7 @@ def test_a_sub_sample_is_tested_and_named(
     assert [some.clips(split) for split in ("train", "val")] == [whole.clips(split) for split in ("train", "val")]
     model = make_model()
     model.adopt(some.assets().with_motion_scale(some.motion_scale()))
-    trainer = make_trainer(logger=CSVLogger(tmp_path), callbacks=[outputs.ScoreTable(media_clips=0)])
+    trainer = make_trainer(logger=CSVLogger(tmp_path), callbacks=[outputs.ScoreTable()])
     with pytest.warns(Note, match=r"a sub-sample of test_[ab], \d clips? by data.test_share"):
         trainer.test(model, datamodule=some, verbose=False)
     assert "30 % of the test clips, a sub-sample" in capsys.readouterr().out
