@@ -156,7 +156,6 @@ def animate_recording(
     options: AnimationOptions, speech: Path, output: Path, files: ExportOptions, *, yes: bool
 ) -> None:
     """Animate one recording, and report the files written."""
-    from facediff.editing.controls import direction_for
     from facediff.export import check_export
     from facediff.export.writing import seeks_weights
     from facediff.pipelines.animate import check_options
@@ -165,8 +164,6 @@ def animate_recording(
     from facediff.speech.voice_activity import speech_problems
     from facediff.utils.hub import may_have_weights
 
-    if options.direction is not None:
-        options = replace(options, direction=direction_for(options.direction, speech))
     check_options(options)
     check_export(output, files, options.samples, weights=may_have_weights(options.checkpoint))
     recording = read_recording(speech, options.max_seconds)  # before the model, which takes longer to load

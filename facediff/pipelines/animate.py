@@ -59,21 +59,14 @@ Progress = Callable[[int, int], object]
 """Called with the progress and the total, in denoising steps or seconds of speech."""
 
 
-def check_directed(options: AnimationOptions) -> None:
-    """Refuse animation controls that contradict each other, and keys of what an option says."""
-    check_controls(options)
-    if (keys := keys_of(options.direction)) is not None:
-        for name in ("style", "condition", "expressivity", "guidance"):
-            if getattr(options, name) is not None:
-                keys.refuse_both(name)
-
-
 def check_options(options: AnimationOptions) -> None:
     """Refuse options that contradict each other and files that are not there, before a model is loaded."""
     expressivity_of(options)
     read_scales(options.guidance)
     read_gate(options.voice_gate or OFF)
-    check_directed(options)
+    check_controls(options)
+    if options.style is not None and (keys := keys_of(options.direction)) is not None:
+        keys.refuse_both("style")
     if options.acting is not None:
         from facediff.editing.acting import read_acting
 
@@ -135,6 +128,7 @@ class AnimationPipeline(ABC):
     style_name = ""
     """Name of the style of the latest motion."""
     channels: Stage | None = None
+    takes_style_keys = False
     step_seconds = 0.01
     """What generating a second of speech takes on two processor cores."""
 
@@ -254,6 +248,8 @@ class AnimationPipeline(ABC):
 
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on."""
+        if direction is not None and not self.takes_style_keys:
+            direction.refuse_model_channels(exported=True)
         self.direction = direction
         self.face = None
         face_direction = None if direction is None else direction.without_model_channels()

@@ -22,9 +22,8 @@ from facediff.animation.options import (
     StreamKeywords,
     with_options,
 )
-from facediff.editing.controls import direction_for, keys_of, refuse_folder
 from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
-from facediff.pipelines.animate import AnimationPipeline, check_directed, check_options
+from facediff.pipelines.animate import AnimationPipeline, check_options
 from facediff.pipelines.motion import Samples
 from facediff.pipelines.video_styles import with_video_styles
 from facediff.utils import SAMPLE_RATE
@@ -445,13 +444,6 @@ class Animator:
         with self.backend.open(settings) as pipeline:
             pipeline.progress = None if isinstance(progress, bool) else progress
             for recording in [speech] if recordings is None else recordings:
-                if not isinstance(recording, str | Path):
-                    refuse_folder(settings.direction)
-                elif settings.direction is not None:
-                    direction = direction_for(settings.direction, Path(recording))
-                    if direction is not settings.direction:
-                        check_directed(replace(settings, direction=direction))
-                        pipeline.direct(keys_of(direction))
                 recording_speech = speech_of(recording, rate, settings.max_seconds)
                 with pipeline.animations(replace(recording_speech, name=name or recording_speech.name)) as samples:
                     animations.append(samples[0] if settings.samples == 1 else Samples(samples))
@@ -490,7 +482,6 @@ class Animator:
 
         rate = int(check_number("speech", "rate", rate, *SAMPLE_RATES, whole=True, remedy="give the rate in Hz"))
         settings = self._options(dtype, **options)
-        refuse_folder(settings.direction)
         with self.backend.open(settings) as pipeline:
             stream = pipeline.stream(rate)
 

@@ -29,7 +29,6 @@ from facediff.utils.licences import Licence, licence_metadata, require_cleared
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
-    from facediff.editing.controls.direction import Direction
 
 FRAME_RATE = 30.0
 """Frames a second by default; any rate will do."""
@@ -251,12 +250,6 @@ class Audio2FacePipeline(AnimationPipeline):
                 Rotation("left_eye", first + 9, "euler"),
             ),
         )
-
-    def direct(self, direction: Direction | None) -> None:
-        """Follow other keys over time from now on; those that a model itself follows are for trained ones."""
-        if direction is not None:
-            direction.refuse_model_channels(exported=True)
-        super().direct(direction)
 
     def metadata(self, seed: int) -> dict[str, str]:
         """What an animation says of the model and its choices."""

@@ -16,7 +16,6 @@ from facediff.utils.files import valid_text
 from facediff.utils.hub import model_name
 
 if TYPE_CHECKING:
-    from facediff.editing.controls.direction import Direction
     from facediff.pipelines.stages import Array
 
 FIXED = ("sampler", "steps", "guidance", "style_template", "precision", "device")
@@ -74,12 +73,6 @@ class ExportedPipeline(AnimationPipeline):
     def corpus(self) -> str:
         """Name of the model's faces in errors."""
         return f"the exported model's corpus {self.model.description.corpus}"
-
-    def direct(self, direction: Direction | None) -> None:
-        """Follow other keys over time from now on; those that a model itself follows need PyTorch."""
-        if direction is not None:
-            direction.refuse_model_channels(exported=True)
-        super().direct(direction)
 
     def frames_of(self, samples: int) -> int:
         """How many frames the model gives for so many samples of speech."""

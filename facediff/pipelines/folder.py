@@ -18,7 +18,7 @@ from facediff.animation.styles import style_paths
 from facediff.editing.controls import keys_file
 from facediff.errors import FaceDiffError, OptionError, check_known, printable
 from facediff.export import FORMATS, check_export
-from facediff.pipelines.animate import check_directed, check_options
+from facediff.pipelines.animate import check_options
 from facediff.pipelines.trained import open_pipeline
 from facediff.speech.audio import read_recording
 from facediff.utils import SAMPLE_RATE
@@ -86,8 +86,6 @@ def animate_folder(
         fit = ".html or .mp4, which show several" if options.samples > 1 else "a format of one file, such as .glb"
         raise OptionError("suffix", f"a batch writes one file for each recording; choose {fit}", suffix)
     files = recordings(speech)
-    if (directions := directions_folder(options)) is not None:
-        check_directions(options, files, directions)
     correspondence = None if options.correspondence is None else Path(options.correspondence)
     if options.target_mesh is not None and correspondence is not None and not correspondence.exists():
         # Otherwise every process would fit the mesh, and a second run would see a file that decides the outputs and
@@ -103,7 +101,6 @@ def animate_folder(
         [f"{name}={json.dumps(value, default=_in_words)}" for name, value in decides.items()],
         make_worker=partial(_load_pipeline, quiet, export),
         files=_deciding_files(options, export),
-        files_of=partial(_own_files, options),
         workers=workers or (None if computes_on_processor(options) or is_cluster(scheduler) else 1),
         scheduler=scheduler,
         retry_failed=retry_failed,
@@ -116,39 +113,6 @@ def _in_words(value: object) -> str:
         return str(value)
     numbers = np.asarray(value)
     return f"{numbers.dtype} {numbers.shape} {hashlib.sha256(numbers.tobytes()).hexdigest()}"
-
-
-def check_directions(options: AnimationOptions, recordings: Sequence[Path], folder: Path) -> None:
-    """Read the keys of every recording, and say which recordings have none."""
-    from facediff.editing.controls.direction import direction_file
-
-    files = {recording: direction_file(folder, recording) for recording in recordings}
-    without = [recording.name for recording, file in files.items() if file is None]
-    if len(without) == len(recordings):
-        expected = f"{recordings[0].stem}.json or {recordings[0].stem}.csv"
-        raise OptionError("direction", f"has no keys for any recording; expected {expected}", folder)
-    for file in files.values():
-        if file is not None:
-            check_directed(replace(options, direction=file))
-    if without:
-        examples = ", ".join(without[:5]) + (" …" if len(without) > 5 else "")
-        print(f"note: {folder}: has no keys for {len(without)} of {len(recordings)} recordings ({examples})")
-
-
-def directions_folder(options: AnimationOptions) -> Path | None:
-    """The folder with the keys over time of each recording, if there is one."""
-    folder = keys_file(options.direction)
-    return folder if folder is not None and folder.is_dir() else None
-
-
-def _own_files(options: AnimationOptions, recording: Path) -> list[Path]:
-    """The files that decide one recording's animation alone: its keys over time."""
-    if (folder := directions_folder(options)) is None:
-        return []
-    from facediff.editing.controls.direction import direction_file
-
-    file = direction_file(folder, recording)
-    return [] if file is None else [file]
 
 
 def _deciding_files(options: AnimationOptions, export: ExportOptions) -> list[Path]:
@@ -199,15 +163,9 @@ def write_correspondence(options: AnimationOptions, files: Sequence[Path]) -> No
 def _load_pipeline(options: AnimationOptions, export: ExportOptions, _command: list[str]) -> Animate:
     """Load what all recordings have in common, once in each process."""
     pipeline = open_pipeline(options)
-    has_directions = directions_folder(options) is not None
 
     def animate(recording: Path, output: Path) -> list[Path]:
         speech = read_recording(recording, options.max_seconds)
-        if has_directions:
-            from facediff.editing.controls.direction import read_direction
-
-            file = next(iter(_own_files(options, recording)), None)
-            pipeline.direct(None if file is None else read_direction(file))
         seed = seed_of_recording(recording, pipeline.seed)
         return list(pipeline.write(speech, output, export, seed=seed)[0])
 
@@ -264,7 +222,6 @@ def run_folder(
     *,
     make_worker: MakeWorker,
     files: Sequence[Path] = (),
-    files_of: Callable[[Path], Sequence[Path]] = lambda _: (),
     workers: int | None = None,
     scheduler: str | None = "",
     retry_failed: bool = False,
@@ -275,8 +232,7 @@ def run_folder(
     is tried again only if something has changed or ``retry_failed`` is given. Each output appears whole or not at all.
     Ctrl-C waits for the recordings that are being animated; the same command continues.
 
-    ``command`` and ``files`` are the options and the files (checkpoint, styles …) that decide the result; ``files_of``
-    gives further ones of one recording.
+    ``command`` and ``files`` are the options and the files (checkpoint, styles …) that decide the result.
     ``make_worker``, a function of a module, is called once in each process with the command.
     """
     if workers is not None and workers < 1:  # 0 would mean the usual number, without a word
@@ -288,10 +244,7 @@ def run_folder(
     check_writable(output / names[0])
     states: dict[Path, tuple[str, str]] = {}  # by recording: "made", "up to date" or "failed", and a remark
     with locked(output / LOCK, "facediff animate"):
-        tasks = [
-            FileTask(speech, output / name, recipe.joined(files_of(speech)))
-            for speech, name in zip(speeches, names, strict=True)
-        ]
+        tasks = [FileTask(speech, output / name, recipe) for speech, name in zip(speeches, names, strict=True)]
         for task in tasks:
             if state := _earlier_state(task, retry_failed):
                 states[task.source] = state

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facediff.animation.options import AnimationOptions, ExportOptions, RecordingOptions
-from facediff.editing.controls import refuse_folder
 from facediff.errors import FaceDiffError, OptionError, refuse_idle
 from facediff.pipelines.animate import check_options
 from facediff.pipelines.trained import open_pipeline
@@ -70,7 +69,6 @@ WHOLE = (
 
 def check_stream(options: AnimationOptions, output: Path, export: ExportOptions) -> None:
     """Refuse options that need the whole animation."""
-    refuse_folder(options.direction)
     check_options(options)
     if str(output) != "-" and output.suffix != ".npy":
         raise OptionError(

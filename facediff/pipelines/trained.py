@@ -62,6 +62,8 @@ class TrainedPipeline(AnimationPipeline):
             checkpoint.
     """
 
+    takes_style_keys = True
+
     def __init__(self, options: AnimationOptions, *, model: AnimationModel | None = None) -> None:
         refuse_idle("is for an exported model", threads=bool(options.threads))
         if model is None:
@@ -116,16 +118,11 @@ class TrainedPipeline(AnimationPipeline):
 
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on."""
-        from facediff.pipelines.directing import ConditionedRun, plan_runs
+        from facediff.pipelines.directing import plan_runs
 
-        style, condition = self.style, self.options.condition
-        if direction is None:
-            self.runs = [ConditionedRun(style, condition, self.model.choices())]
-        else:
-            if style is not None:
-                direction.refuse_both("style")
-            template = self.options.style_template
-            self.runs = plan_runs(direction, self.model, self.identity, style, condition, template)
+        if direction is not None and self.style is not None:
+            direction.refuse_both("style")
+        self.runs = plan_runs(direction, self.model, self.identity, self.style, self.options.style_template)
         super().direct(direction)
 
     def frames_of(self, samples: int) -> int:
@@ -144,11 +141,11 @@ class TrainedPipeline(AnimationPipeline):
         audio, motions = torch.from_numpy(speech).to(self.model.device), []
         styles: dict[str, None] = {}
         for run in self.runs:
-            with self.precision(), self.model.choosing(run.choices):
+            with self.precision():
                 samples = self.model.animate_samples(
                     audio,
                     identity=self.identity,
-                    condition=run.condition,
+                    condition=self.options.condition,
                     style=run.style,
                     seeds=seeds,
                     progress=partial(self.track, description="sampling"),
@@ -203,7 +200,14 @@ class TrainedPipeline(AnimationPipeline):
     def _directed(self, seeds: Sequence[int]) -> DirectedStream:
         from facediff.pipelines.directing import DirectedStream
 
-        return DirectedStream(self.model, self.runs, identity=self.identity, seeds=seeds, precision=self.precision)
+        return DirectedStream(
+            self.model,
+            self.runs,
+            identity=self.identity,
+            condition=self.options.condition,
+            seeds=seeds,
+            precision=self.precision,
+        )
 
     def _choose_expressivity(self) -> None:
         """Take over the options' expressivity, which may differ between the face's regions."""

@@ -183,10 +183,6 @@ class Recipe:
         """Read the files."""
         return cls(tuple(command), {str(path): sha256(path) for path in files})
 
-    def joined(self, files: Sequence[Path]) -> Recipe:
-        """The recipe with further files."""
-        return replace(self, files={**self.files, **Recipe.of((), files).files}) if files else self
-
 
 @dataclass(frozen=True)
 class FileTask:

@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import facediff
-from facediff.animation import read_archive
-from facediff.animation.options import AnimationOptions
 from facediff.cli.app import main
-from facediff.editing.controls.direction import CHANNELS, METADATA, Direction, Key, read_direction, text_shares
-from facediff.editing.controls.expressiveness import region_factors
+from facediff.editing.controls.direction import CHANNELS, ENDED, METADATA, Direction, Key, read_direction, text_shares
 from facediff.editing.controls.eyelids import puppet_eyes
 from facediff.errors import FaceDiffError
-from facediff.pipelines.folder import animate_folder
 from facediff.speech.audio import read_speech
 
 QUICK = {"identity": "F1", "steps": 2, "voice_gate": "off"}
@@ -42,9 +36,6 @@ def rows(channel: str, *values: float | str, kind: str = "smooth") -> list[dict[
     [
         ("style", "M2_e05", {"style": "M2_e05"}),
         ("style", "F1_e03:0.3,M2_e05:0.7", {"style": "F1_e03:0.3,M2_e05:0.7"}),
-        ("condition", "M2", {"condition": "M2"}),
-        ("expressivity", 0.3, {"expressivity": 0.3}),
-        ("expressivity.lips", 0.4, {"expressivity": "lips=0.4"}),
         ("expressiveness", 1.3, {"expressiveness": 1.3}),
         ("expressiveness.upper_face", 1.7, {"expressiveness": "upper_face=1.7"}),
         ("blinks", 30.0, {"blinks": 30.0}),
@@ -73,19 +64,6 @@ def test_style_crossfades_between_the_plain_styles(model: facediff.Animator, spe
     assert 0 < alone.sum() < len(alone)
     np.testing.assert_array_equal(made.vertices[alone], plain["F1_e03"][alone])
     assert not np.array_equal(plain["F1_e03"], plain["M2_e05"])
-
-
-def test_expressivity_goes_from_the_mean_to_a_sample(model: facediff.Animator, speech: np.ndarray) -> None:
-    keys = rows("expressivity", 0.2, 1.6) + rows("expressivity.lips", 1.0, 0.4, kind="linear")
-    made = model.animate(speech, 16_000, direction=keys, seed=3, **QUICK)
-    mean, sample = (model.animate(speech, 16_000, expressivity=e, seed=3, **QUICK).vertices for e in (0, 1))
-    for frame in (0, 7, 20, len(mean) - 1):
-        now = {key: each[0] for key, each in Direction.parse(keys, "keys").at([frame / 25]).items()}
-        share = region_factors(
-            made.template, made.regions, {"all": now["expressivity"], "lips": now["expressivity.lips"]}
-        )
-        expected = mean[frame] + share[:, None] * (sample[frame] - mean[frame])
-        np.testing.assert_allclose(made.vertices[frame], expected, atol=1e-6)
 
 
 def test_expressiveness_scales_each_frame_by_its_curve(model: facediff.Animator, speech: np.ndarray) -> None:
@@ -153,7 +131,6 @@ def test_lids_shut_by_their_share(model: facediff.Animator) -> None:
 
 FULL = [
     *rows("style", "F1_e03", "M2_e05"),
-    *rows("expressivity", 0.2, 1.5),
     *rows("expressiveness.upper_face", 1, 2, 1, kind="step"),
     *rows("head.pitch", 0, 5, 0),
     *rows("brows", 0, 2, 0),
@@ -178,8 +155,9 @@ def test_stream_is_the_file_however_it_is_cut(model: facediff.Animator, speech: 
         stream.finish()
     turned = np.concatenate([part for part in [*heads, stream.heads] if part is not None])
     np.testing.assert_array_equal(turned, model.animate(speech, 16_000, **options).head)
-    with pytest.raises(FaceDiffError, match="blinks"):
-        model.stream([], direction=rows("blinks", 3))
+    for channel in ("blinks", "expressivity"):
+        with pytest.raises(FaceDiffError, match=channel):
+            model.stream([], direction=rows(channel, 2))
 
 
 def test_a_take_is_repeated_from_its_metadata(model: facediff.Animator, speech: np.ndarray, tmp_path: Path) -> None:
@@ -209,33 +187,6 @@ def test_acting_is_off_unless_it_is_asked_for_and_rests_in_silence(model: facedi
         facediff.Animation("x", plain.vertices, plain.template, 25.0, plain.faces).control(acting="prosody")
 
 
-def test_a_batch_takes_the_keys_of_each_recording(
-    model: facediff.Animator, workplace: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recordings = workplace / "in"
-    recordings.mkdir()
-    for name in "abc":
-        shutil.copy("speech.wav", recordings / f"{name}.wav")
-    Direction.parse(rows("brows", 3), "a").save(recordings / "a.direction.json")
-    Direction.parse(rows("head.yaw", 0, 5), "b").save(recordings / "b.csv")
-    options = AnimationOptions(checkpoint="demo/puppet.ckpt", steps=1, direction=recordings)
-    run = dict(speech=[recordings], output=Path("out"), suffix=".npz", workers=1)
-    assert animate_folder(options, **run) == 0
-    assert "c.wav" in capsys.readouterr().out
-    found = {path.stem: METADATA in read_archive(path).metadata for path in sorted(Path("out").glob("*.npz"))}
-    assert found == {"a": True, "b": True, "c": False}
-    Direction.parse(rows("brows", 2), "a").save(recordings / "a.direction.json")
-    assert animate_folder(options, **run) == 0
-    assert "1 made" in capsys.readouterr().out.splitlines()[-1]
-    (recordings / "b.csv").write_text("time,channel,value\n0,brows,99\n")
-    with pytest.raises(FaceDiffError, match=r"b\.csv: row 2"):
-        animate_folder(options, **run)
-    # Keys of a folder are compared with the options as those of one file are.
-    (recordings / "b.csv").write_text("time,channel,value\n0,expressivity,1\n")
-    with pytest.raises(FaceDiffError, match=r"b\.csv: channel expressivity: .*--expressivity"):
-        animate_folder(replace(options, expressivity="0.5"), **run)
-    with pytest.raises(FaceDiffError, match=r"b\.csv: channel expressivity: .*--expressivity"):
-        model.animate(recordings / "b.wav", direction=recordings, expressivity=0.5, **QUICK)
 
 
 def test_command_names_what_is_wrong_and_writes_nothing(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -248,10 +199,10 @@ def test_command_names_what_is_wrong_and_writes_nothing(workplace: Path, capsys:
 
 
 def test_directions_add_up_in_the_metadata(model: facediff.Animator, speech: np.ndarray) -> None:
-    first, second = rows("expressivity", 0.2, 0.9), rows("brows", 0, 2)
+    first, second = rows("style", "F1_e03", "M2_e05"), rows("brows", 0, 2)
     made = model.animate(speech, 16_000, direction=first, **QUICK)
     both = made.control(direction=second)
-    assert {*Direction.parse(both.metadata[METADATA], "m").channels} == {"expressivity", "brows"}
+    assert {*Direction.parse(both.metadata[METADATA], "m").channels} == {"style", "brows"}
     with pytest.raises(FaceDiffError, match="has these keys already"):  # the motion would add up, and they would not
         both.control(direction=second)
 
@@ -267,7 +218,7 @@ def test_the_page_shows_one_direction_in_two_ways(tmp_path: Path) -> None:
         path.write_text(block)
     one, other = (read_direction(path) for path in files.values())
     assert one.keys == other.keys
-    for name in CHANNELS:
+    for name in CHANNELS.keys() - ENDED:
         assert f"`{name}" in PAGE
 
 

@@ -23,7 +23,7 @@ def check_controls(controls: AnimationControls) -> None:
         ("direction", keys_file(controls.direction), "keys over time, .json or .csv, or a mood such as calm"),
         ("eyes", controls.eyes, ".json (see docs/animation_controls.md)"),
     ):
-        if path is not None and not Path(path).exists():
+        if path is not None and not Path(path).is_file():
             raise OptionError(option, f"no such file; expected {expected}", path)
     for option, idle, users in (
         ("controls_seed", not is_procedural(controls), "{blinks}, {gaze}, {sway} or {acting}"),
@@ -39,7 +39,7 @@ def check_controls(controls: AnimationControls) -> None:
 
 
 def keys_file(direction: DirectionLike | None) -> Path | None:
-    """The file or folder of keys over time; None where the keys themselves or a mood were given."""
+    """The file of keys over time; None where the keys themselves or a mood were given."""
     if not isinstance(direction, str | Path):
         return None
     from facediff.editing.controls.direction import is_mood
@@ -47,42 +47,20 @@ def keys_file(direction: DirectionLike | None) -> Path | None:
     return None if is_mood(direction) else Path(direction)
 
 
-def refuse_folder(direction: DirectionLike | None) -> None:
-    """Refuse a folder of keys where no recording's name says which of its files is meant."""
-    if (folder := keys_file(direction)) is not None and folder.is_dir():
-        raise OptionError("direction", "is a folder, of keys for recordings by their names; give one file", folder)
-
-
-def direction_for(direction: DirectionLike, recording: Path) -> DirectionLike:
-    """The keys over time of one recording, where a folder has a file for each."""
-    folder = keys_file(direction)
-    if folder is None or not folder.is_dir():
-        return direction
-    from facediff.editing.controls.direction import direction_file
-
-    if (file := direction_file(folder, recording)) is None:
-        raise OptionError(
-            "direction", f"has no {recording.stem}.json or {recording.stem}.csv; give the file's name", folder
-        )
-    return file
-
-
 def keys_of(direction: DirectionLike | None) -> Direction | None:
-    """The keys over time; None if there are none, or each recording of a folder has its own."""
+    """The keys over time; None if there are none."""
     if direction is None:
         return None
     from facediff.editing.controls.direction import Direction, read_direction
 
     if isinstance(direction, str | Path):
-        return None if Path(direction).is_dir() else read_direction(direction)
+        return read_direction(direction)
     return direction if isinstance(direction, Direction) else Direction.parse(direction, "direction")
 
 
 def is_procedural(controls: AnimationControls) -> bool:
     """Whether something is drawn at random: blinks, gaze, sway or acting."""
     if (controls.blinks, controls.gaze, controls.sway, controls.acting) != (None, None, None, None):
-        return True
-    if (file := keys_file(controls.direction)) is not None and file.is_dir():
         return True
     keys = keys_of(controls.direction)
     return keys is not None and any(keys.under(name) for name in ("blinks", "gaze", "sway"))

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.controls import keys_of, procedural, refuse_folder
+from facediff.editing.controls import keys_of, procedural
 from facediff.editing.controls.direction import METADATA, Direction, channel_of, curve, direction_of
 from facediff.editing.controls.expressiveness import ALL, check_factors, read_factors, scaled_regions
 from facediff.editing.controls.eyelids import GIVE, Array, Eyes, eyes_for
@@ -248,7 +248,6 @@ def apply_controls(animation: Animation, controls: AnimationControls, *, seed: i
     """A finished animation with controls applied, acting among them; the same object if there are none."""
     if controls.is_off:
         return animation
-    refuse_folder(controls.direction)
     direction = keys_of(controls.direction)
     if direction is not None:
         direction.refuse_model_channels()

@@ -21,7 +21,7 @@ from facediff.spaces.arkit import ARKIT, LEFT_AND_RIGHT
 from facediff.utils import ranges
 from facediff.utils.hints import Range, check_number, shown
 from facediff.utils.limits import check_format, quoted
-from facediff.utils.paths import find_file, from_home
+from facediff.utils.paths import from_home
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_columns, write_json, write_rows
 from facediff.utils.records import read_record
 
@@ -65,6 +65,7 @@ class Channel:
 
 CHANNELS: dict[str, Channel] = {
     "style": Channel(None, in_model=True),
+    # Of 1.x: they are read, and no longer followed.
     "condition": Channel(None, in_model=True),
     "expressivity": Channel(ranges.EXPRESSIVITY, regions=True, in_model=True),
     "guidance": Channel(ranges.GUIDANCE_SCALE, parts=("speech", "identity", "style"), in_model=True),
@@ -79,6 +80,7 @@ CHANNELS: dict[str, Channel] = {
     "head": Channel(Range(-30, 30), parts=("pitch", "yaw", "roll")),  # degrees
 }
 """All channels, by the name in front of a dot."""
+ENDED = ("condition", "expressivity", "guidance")
 
 
 def channel_of(name: str) -> Channel:
@@ -105,7 +107,7 @@ class Key:
     Attributes:
         time: in seconds; frame i of an animation is at i / frame rate.
         channel: name of the channel.
-        value: a number, or a text for ``style`` and ``condition``.
+        value: a number, or a text for ``style``.
         interpolation: how the channel goes on from here to its next key.
         slope: change a second at this key, for ``smooth`` curves of numbers; chosen so that the curve does not
             overshoot if None.
@@ -179,12 +181,6 @@ class Direction:
     def under(self, name: str) -> dict[str, tuple[Key, ...]]:
         """The channels with this name before the dot."""
         return {channel: keys for channel, keys in self.channels.items() if channel.partition(".")[0] == name}
-
-    def constant(self, channel: str) -> float | str | None:
-        """The one value of a channel that never changes; None if it does, or has no keys."""
-        keys = self.channels.get(channel, ())
-        values = {key.value for key in keys}
-        return next(iter(values)) if len(values) == 1 and not any(key.slope for key in keys) else None
 
     def at(self, times: npt.ArrayLike) -> dict[str, Array]:
         """The channels' numbers (T,) at times (T,) in seconds; channels of texts are left out, see :meth:`shares`."""
@@ -337,15 +333,6 @@ def direction_of(animation: Animation) -> Direction | None:
         return Direction.parse(animation.metadata.get(METADATA), animation.name)
     except FaceDiffError:
         return None
-
-
-def direction_file(folder: Path, recording: Path) -> Path | None:
-    """The file of a folder that has the keys for a recording: ``NAME.direction.json``, ``NAME.json`` or ``.csv``."""
-    for name in (f"{recording.stem}.direction", recording.stem):
-        for suffix in (".json", ".csv"):
-            if (path := find_file(folder / f"{name}{suffix}")).is_file():
-                return path
-    return None
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:

@@ -54,7 +54,7 @@ UNITS = {"brows": "mm", "blinks": "a minute", "gaze": "degrees", "sway": "degree
 """Units of channels of keys; the others are factors."""
 USUAL = {"head": (-10.0, 10.0)}
 """First range of a lane, where the full range is far larger than usual values."""
-REST = {"expressivity": 1.0, "guidance": 1.0, "expressiveness": 1.0, "acting": 1.0}
+REST = {"expressiveness": 1.0, "acting": 1.0}
 """Values of channels without keys, and of their first key; 0 for the others."""
 PREVIEWED = ("expressiveness", "head")
 POSED = ("brows", "lids", "shape")
@@ -170,6 +170,8 @@ def _direction_facts() -> dict[str, Any]:
     """Facts of the file of keys and of the channels, for the editor."""
     channels: dict[str, dict[str, Any]] = {}
     for name, channel in direction.CHANNELS.items():
+        if name in direction.ENDED:
+            continue
         limits = channel.range
         rest = min(max(REST.get(name, 0.0), limits.least), limits.most) if limits else ""
         facts = {

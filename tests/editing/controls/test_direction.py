@@ -91,11 +91,6 @@ def test_equal_keys_give_their_value_to_the_last_bit() -> None:
         assert set(curve(keys(1.1, 1.1, 1.1, kind=kind), TIMES, eased=True).tolist()) == {1.1}
 
 
-def test_a_channel_that_never_changes_is_constant() -> None:
-    made = Direction([*keys(1.2, 1.2), Key(0, "sway", 1), Key(1, "sway", 2), Key(0, "gaze", 2, slope=1.0)])
-    assert [made.constant(name) for name in (LARGER, "sway", "gaze", "blinks")] == [1.2, None, None, None]
-
-
 @pytest.mark.parametrize("suffix", [".json", ".csv"])
 def test_files_come_back_as_they_were(tmp_path: Path, suffix: str) -> None:
     made = Direction(

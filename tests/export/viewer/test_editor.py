@@ -124,7 +124,7 @@ def test_keys_come_back_as_they_were_and_their_curves_are_those_of_python(show: 
         assert np.allclose(found, expected, atol=1e-9)
     assert page.evaluate("[direction.hidden, document.querySelectorAll('.lane').length]") == [False, 3]
     offered = page.evaluate("[...document.getElementById('add-channel').options].map(({ value }) => value)")
-    assert {"acting", "head.pitch", "expressiveness.lips", f"expressivity.{LOW}"} < set(offered)
+    assert {"acting", "head.pitch", "expressiveness.lips", f"expressiveness.{LOW}"} < set(offered)
     assert "head" not in offered
     assert page.evaluate("window.hacked") is None
     # Lanes that have left the page are not drawn any more, when the colours change.
