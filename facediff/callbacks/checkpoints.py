@@ -24,9 +24,9 @@ import torch
 from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
 from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, ThroughputMonitor
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from lightning.pytorch.trainer.states import RunningStage, TrainerFn
+from lightning.pytorch.trainer.states import TrainerFn
 
 from facediff.callbacks.runs import JOB_FILE, LAST, STATE_KEY, ResumableCSVLogger, job_text, logger_versions, run_folder
 from facediff.data import SpeechMotionDataModule
@@ -36,8 +36,6 @@ from facediff.utils.files import atomic
 from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
 from facediff.utils.torch_files import load_tensors
-
-TRAIN = RunningStage.TRAINING
 
 SHARE_OF_TIME = 0.05
 """The largest share of the training time that saving may take."""
@@ -151,7 +149,6 @@ class LastCheckpoint(Callback):
             states = self._resumed.get("random", [])
             if states:
                 restore_random_states(states[min(trainer.global_rank, len(states) - 1)])
-            continue_counting(trainer, self._resumed.get("throughput", []))
             trainer.fit_loop.restarting = False  # schedules that follow a metric would miss the first epoch's end
             if self._resumed.get("place") == "step":
                 # Lightning has counted a validation that it did not run again.
@@ -250,7 +247,6 @@ class LastCheckpoint(Callback):
             "random": gathered(trainer, random_states()),
             "rows": rows,
             "versions": logger_versions(trainer) if trainer.is_global_zero else [],
-            "throughput": [counted(monitor) for monitor in throughput_monitors(trainer)],
         }
         # Lightning has counted the batch that is about to be trained as "ready", and would take it for trained.
         loop = checkpoint["loops"]["fit_loop"]
@@ -411,32 +407,6 @@ def slurm_plugins(plugins: object = None) -> list[Any]:
             plugin.auto_requeue = False
     needed = SLURMEnvironment.detect() and not any(isinstance(plugin, ClusterEnvironment) for plugin in stated)
     return [*stated, *([SLURMEnvironment(auto_requeue=False)] if needed else [])]
-
-
-def throughput_monitors(trainer: Trainer) -> list[ThroughputMonitor]:
-    """The callbacks that count batches and samples."""
-    return [callback for callback in trainer.callbacks if isinstance(callback, ThroughputMonitor)]  # type: ignore[attr-defined]
-
-
-# Lightning's monitor keeps no state of its own, and its private counters are the only place to put it back. In a
-# release that names them otherwise, a resumed run counts from zero; tests/callbacks/test_checkpoints.py says so.
-
-
-def counted(monitor: ThroughputMonitor) -> list[float]:
-    """Samples, batches and seconds of training that a monitor has counted; empty before it has begun."""
-    samples, batches, began = (getattr(monitor, name, {}).get(TRAIN) for name in ("_samples", "_batches", "_t0s"))
-    return (
-        [] if samples is None or batches is None or began is None else [samples, batches, time.perf_counter() - began]
-    )
-
-
-def continue_counting(trainer: Trainer, counts: list[list[float]]) -> None:
-    """Set the monitors' counts to their values in the checkpoint."""
-    for monitor, counters in zip(throughput_monitors(trainer), counts, strict=False):
-        if counted(monitor) and counters:
-            samples, batches, *_, seconds = counters  # 1.x has a third counter
-            monitor._samples[TRAIN], monitor._batches[TRAIN] = int(samples), int(batches)
-            monitor._t0s[TRAIN] -= seconds
 
 
 def agreed(trainer: Trainer, due: bool, number: int) -> tuple[bool, int]:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from facediff.animation.options import StyleLike
     from facediff.models import AnimationModel
     from facediff.pipelines.animate import Progress
-    from facediff.pipelines.audio2face import Audio2FaceWeights, Part
+    from facediff.pipelines.audio2face import Part
     from facediff.runtime import RuntimeModel
     from facediff.runtime.audio2face import Audio2Face
     from facediff.speech.audio import Speech, Waveform
@@ -127,19 +127,7 @@ def import_checkpoint(
 
 
 class Backend(ABC):
-    """A kind of model under an :class:`Animator`.
-
-    Attributes:
-        identities: those that it was trained on; the first one is the default.
-        other_identities: further ones with a known face.
-        frame_rate: frames a second of its animations.
-        unit: unit of length of its animations.
-        n_vertices: vertices of its faces.
-        corpus: that it was trained on.
-        licence: the licences of its data and its weights, in a line.
-        commercial_use: whether the strictest of them allows commercial use.
-        device: where it computes.
-    """
+    """A kind of model under an :class:`Animator`, with its facts."""
 
     identities: list[str]
     other_identities: list[str]
@@ -224,32 +212,23 @@ class ExportedBackend(Backend):
 
 
 class Audio2FaceBackend(Backend):
-    """An open folder of Audio2Face-3D, without PyTorch.
-
-    Attributes:
-        weights: how weights of its blendshapes are solved for; may be changed.
-    """
+    """An open folder of Audio2Face-3D, without PyTorch."""
 
     def __init__(self, model: Audio2Face) -> None:
-        from facediff.pipelines.audio2face import FRAME_RATE, UNIT, Audio2FaceWeights, licences_of
+        from facediff.pipelines.audio2face import FRAME_RATE, UNIT, licences_of
 
         self.model, facts = model, model.folder.facts
         self.identities, self.other_identities = [facts.actor or "actor"], []
-        self.frame_rate, self.unit, self.n_vertices, self.corpus = (
-            FRAME_RATE,
-            UNIT,
-            facts.skin_vertices,
-            "Audio2Face-3D",
-        )
+        self.frame_rate, self.unit, self.n_vertices = FRAME_RATE, UNIT, facts.skin_vertices
+        self.corpus = "Audio2Face-3D"
         self.licence, self.commercial_use = in_words(licences_of(model)), commercial_use(licences_of(model))
-        self.weights: Audio2FaceWeights = Audio2FaceWeights()
 
     @contextmanager
     def open(self, options: AnimationOptions) -> Iterator[AnimationPipeline]:
         """The model with its choices made."""
         from facediff.pipelines.audio2face import Audio2FacePipeline
 
-        yield Audio2FacePipeline(options, model=self.model, frame_rate=self.frame_rate, weights=self.weights)
+        yield Audio2FacePipeline(options, model=self.model)
 
 
 class Animator:
@@ -265,7 +244,14 @@ class Animator:
 
     Attributes:
         model: the LightningModule, or the open folder.
-        backend: the kind of model with its facts.
+        identities: those that it was trained on; the first one is the default.
+        other_identities: further ones with a known face, without motion in the training data.
+        frame_rate: frames a second of its animations; of Audio2Face-3D it may be set.
+        unit: unit of length of its animations.
+        n_vertices: vertices of its faces.
+        corpus: that it was trained on.
+        licence: the licences of its data and its weights, in a line; see docs/publishing.md.
+        commercial_use: whether the strictest of them allows commercial use: allowed, forbidden or unknown.
     """
 
     def __init__(
@@ -277,7 +263,10 @@ class Animator:
     ) -> None:
         precision_of(dtype)  # refuses other types
         self.model: Any = model
-        self.backend = backend_of(model)
+        self.backend = facts = backend_of(model)
+        self.identities, self.other_identities = facts.identities, facts.other_identities
+        self.frame_rate, self.unit, self.n_vertices = facts.frame_rate, facts.unit, facts.n_vertices
+        self.corpus, self.licence, self.commercial_use = facts.corpus, facts.licence, facts.commercial_use
         self.source = type(model).__name__ if source is None else source
         self.dtype = str(dtype).removeprefix("torch.")
 
@@ -285,52 +274,6 @@ class Animator:
     def module(self) -> AnimationModel:
         """The LightningModule of a trained model."""
         return cast("AnimationModel", self.model)
-
-    @property
-    def identities(self) -> list[str]:
-        """The identities that it was trained on; the first one is the default."""
-        return self.backend.identities
-
-    @property
-    def other_identities(self) -> list[str]:
-        """Further identities with a known face, without motion in the training data."""
-        return self.backend.other_identities
-
-    @property
-    def frame_rate(self) -> float:
-        """Frames a second of its animations; of Audio2Face-3D it may be set."""
-        return self.backend.frame_rate
-
-    @frame_rate.setter
-    def frame_rate(self, value: float) -> None:
-        if not isinstance(self.backend, Audio2FaceBackend):
-            raise AttributeError("frame_rate: a model has that of its corpus")
-        self.backend.frame_rate = value
-
-    @property
-    def unit(self) -> str:
-        """Unit of length of its animations."""
-        return self.backend.unit
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of its faces."""
-        return self.backend.n_vertices
-
-    @property
-    def corpus(self) -> str:
-        """The corpus that it was trained on."""
-        return self.backend.corpus
-
-    @property
-    def licence(self) -> str:
-        """The licences of its data and its weights, in a line; see docs/publishing.md."""
-        return self.backend.licence
-
-    @property
-    def commercial_use(self) -> Commercial:
-        """Whether the strictest of its licences allows commercial use: allowed, forbidden or unknown."""
-        return self.backend.commercial_use
 
     @property
     def device(self) -> str:
@@ -570,37 +513,29 @@ def backend_of(model: AnimationModel | RuntimeModel | Audio2Face) -> Backend:
 class Audio2FaceAnimator(Animator):
     """A folder of Audio2Face-3D, with its blendshapes; ``style="joy:0.7,pain:0.2"`` says how strong each emotion is."""
 
-    backend: Audio2FaceBackend
+    def _options(self, dtype: DType | None, **options: Any) -> AnimationOptions:  # noqa: ANN401
+        if self.frame_rate != self.backend.frame_rate:
+            options.setdefault("frame_rate", self.frame_rate)
+        return super()._options(dtype, **options)
 
     @property
     def emotions(self) -> tuple[str, ...]:
         """The emotions that have a strength."""
         return cast("Audio2Face", self.model).folder.facts.emotions
 
-    @property
-    def weights(self) -> Audio2FaceWeights:
-        """How weights of its blendshapes are solved for; may be set."""
-        return self.backend.weights
-
-    @weights.setter
-    def weights(self, weights: Audio2FaceWeights) -> None:
-        self.backend.weights = weights
-
-    def solve(
-        self, part: Part, vertices: npt.NDArray[np.float32], temporal: float | None = None
-    ) -> npt.NDArray[np.float32]:
-        """Weights (T, K) of the folder's blendshapes for vertices.
+    def solve(self, part: Part, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """NVIDIA's weights (T, K) of the folder's blendshapes for vertices.
 
         Args:
             part: of the face: ``skin`` or ``tongue``.
             vertices: absolute positions (T, V, 3) of all of its vertices.
-            temporal: strength of the temporal term; as :attr:`weights` if None.
 
         Raises:
             FaceDiffError: if the folder has no such shapes, or the vertices are others.
         """
-        weights = self.weights if temporal is None else replace(self.weights, temporal=temporal)
-        return weights.solve(self.model, part, vertices)
+        from facediff.pipelines.audio2face import solve_weights
+
+        return solve_weights(self.model, part, vertices)
 
 
 def precision_of(dtype: DType) -> Literal["32", "bf16"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.options import AnimationOptions
-from facediff.editing.regularised_weights import Regularisation, RegularisedSolver, TemporalTerm, pairs_of
+from facediff.editing.regularised_weights import Regularisation, RegularisedSolver, pairs_of
 from facediff.errors import FaceDiffError, OptionError, refuse_idle
 from facediff.pipelines.animate import AnimationPipeline
 from facediff.pipelines.exported import FIXED
 from facediff.pipelines.stages import Stage, Take
 from facediff.runtime.audio2face import LICENCE, Array, Audio2Face, FaceAnimator
-from facediff.runtime.audio2face_folder import Poses
 from facediff.spaces import Rotation, Space
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.rotations import convert
@@ -37,79 +36,32 @@ UNIT = "cm"
 
 Part = Literal["skin", "tongue"]
 
-Solver = Literal["nvidia", "facediff"]
-"""Solver of the weights: NVIDIA's regularised system, or facediff's bounded least squares."""
 
+def solve_weights(model: Audio2Face, part: Part, vertices: Array) -> Array:
+    """NVIDIA's weights (T, K) of the folder's blendshapes, in the order of ``model.folder.poses[part].names``.
 
-@dataclass(frozen=True)
-class Audio2FaceWeights:
-    """How weights of a folder's blendshapes are solved for.
-
-    Attributes:
-        solver: of the weights: ``nvidia`` or ``facediff``.
-        temporal_term: of NVIDIA's solver: ``published`` shrinks motion where its strength is not 0, ``corrected`` does
-            what it is for.
-        temporal: strength of that term; as in the folder if None.
+    Args:
+        model: the model.
+        part: of the face.
+        vertices: absolute positions (T, V, 3) of all of its vertices.
     """
-
-    solver: Solver = "nvidia"
-    temporal_term: TemporalTerm = "published"
-    temporal: float | None = None
-
-    def solve(self, model: Audio2Face, part: Part, vertices: Array) -> Array:
-        """Weights (T, K) of the folder's blendshapes, in the order of ``model.folder.poses[part].names``.
-
-        Args:
-            model: the model.
-            part: of the face.
-            vertices: absolute positions (T, V, 3) of all of its vertices.
-        """
-        poses = model.folder.poses.get(part)
-        if poses is None:
-            folder = model.folder.network.parent
-            raise FaceDiffError(f"{folder}: has no blendshapes of the {part}; get the whole folder")
-        if self.solver == "facediff":
-            return nearest(poses, vertices)
-        settings = poses.settings
-        regularisation = Regularisation(
-            l1=settings.l1,
-            l2=settings.l2,
-            temporal=settings.temporal if self.temporal is None else self.temporal,
-            symmetry=settings.symmetry,
-            template_size=settings.template_size,
-            temporal_term=self.temporal_term,
-        )
-        solver = RegularisedSolver(
-            poses.neutral,
-            poses.deltas,
-            mask=poses.mask,
-            regularisation=regularisation,
-            active=settings.active,
-            symmetric=pairs_of(settings.symmetric),
-            cancel=pairs_of(settings.cancel),
-            multipliers=settings.multipliers,
-            offsets=settings.offsets,
-        )
-        return solver.solve(np.asarray(vertices).reshape(len(vertices), -1, 3)).astype(np.float32)
-
-
-def nearest(poses: Poses, vertices: Array) -> Array:
-    """The weights (T, K) by which the shapes come nearest to the vertices, each frame by itself."""
-    from facediff.animation import Animation
-    from facediff.editing.blendshapes import SolveOptions, solve
-    from facediff.editing.shapes import ShapeSet
-
-    shapes = ShapeSet(poses.names, poses.neutral.astype(np.float64), poses.deltas.astype(np.float64))
-    regions = {"mask": poses.mask} if len(poses.mask) else {}
-    animation = Animation("poses", np.asarray(vertices), poses.neutral, FRAME_RATE, unit=UNIT, regions=regions)
-    options = SolveOptions(
-        smoothness=0, sparsity=0, area_weighted=False, residual_limit=1.0, region="mask" if regions else None
+    poses = model.folder.poses.get(part)
+    if poses is None:
+        raise FaceDiffError(f"{model.folder.network.parent}: has no blendshapes of the {part}; get the whole folder")
+    settings = poses.settings
+    strengths = (settings.l1, settings.l2, settings.temporal, settings.symmetry, settings.template_size)
+    solver = RegularisedSolver(
+        poses.neutral,
+        poses.deltas,
+        mask=poses.mask,
+        regularisation=Regularisation(*strengths),
+        active=settings.active,
+        symmetric=pairs_of(settings.symmetric),
+        cancel=pairs_of(settings.cancel),
+        multipliers=settings.multipliers,
+        offsets=settings.offsets,
     )
-    solved = solve(animation, shapes, options)
-    weights = np.zeros((len(vertices), len(poses.names)), np.float32)
-    for column, name in enumerate(solved.names):
-        weights[:, poses.names.index(name)] = solved.values[:, column]
-    return weights
+    return solver.solve(np.asarray(vertices).reshape(len(vertices), -1, 3)).astype(np.float32)
 
 
 class Audio2FacePipeline(AnimationPipeline):
@@ -118,22 +70,12 @@ class Audio2FacePipeline(AnimationPipeline):
     Args:
         options: the choices; ``style`` says how strong each emotion is.
         model: a model that is open already. None to open the folder.
-        frame_rate: frames a second.
-        weights: how weights are solved for.
     """
 
-    def __init__(
-        self,
-        options: AnimationOptions,
-        *,
-        model: Audio2Face | None = None,
-        frame_rate: float | None = None,
-        weights: Audio2FaceWeights | None = None,
-    ) -> None:
+    def __init__(self, options: AnimationOptions, *, model: Audio2Face | None = None) -> None:
         refuse_fixed(options)
-        frame_rate = options.frame_rate or frame_rate or FRAME_RATE
+        frame_rate = options.frame_rate or FRAME_RATE
         self.model = Audio2Face.open(options.checkpoint, threads=options.threads) if model is None else model
-        self.weights = weights or Audio2FaceWeights()
         folder = self.model.folder
         self.actor = folder.facts.actor or "actor"
         if options.commercial_only:
@@ -216,9 +158,9 @@ class Audio2FacePipeline(AnimationPipeline):
         """With the weights of the face and the tongue, and how jaw and eyes turn."""
         animated = {name: np.concatenate([part[name] for part in self._animated]) for name in self._animated[0]}
         poses = self.model.folder.poses
-        columns = {"skin": self.weights.solve(self.model, "skin", animation.vertices)}
+        columns = {"skin": solve_weights(self.model, "skin", animation.vertices)}
         if "tongue" in poses:
-            columns["tongue"] = self.weights.solve(self.model, "tongue", animated["tongue_vertices"])
+            columns["tongue"] = solve_weights(self.model, "tongue", animated["tongue_vertices"])
         turned = convert(animated["jaw_transform"][:, :3, :2].swapaxes(1, 2).reshape(-1, 6), "six_d", "axis_angle")
         eyes = np.deg2rad(animated["eyes_rotation"])
         still = np.zeros((len(eyes), 1))

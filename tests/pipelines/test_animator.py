@@ -130,7 +130,7 @@ TONE = (0.3 * np.sin(np.arange(16000) / 7)).astype(np.float32)
         ([TONE.astype(int), 16000], {}, "speech: is int64"),
         ([np.zeros((2, 3, 4)), 16000], {}, "speech"),
         ([TONE, 16000], {"max_seconds": 0.5}, "max_seconds"),
-        ([TONE, 16000], {"direction": "."}, "direction .: is a folder"),
+        ([TONE, 16000], {"direction": "."}, "direction .: no such file"),
         ([TONE, 16000], {"voice_gate": "energie"}, "voice_gate energie"),
         (["tone.wav"], {"identity": "Zoe"}, '"Zoe"'),
         (["tone.wav"], {"style": "F1_e99"}, "style F1_e99"),

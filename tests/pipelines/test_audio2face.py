@@ -6,7 +6,6 @@ import csv
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,7 @@ def model(folder: Path, content: dict[str, Any]) -> Audio2FaceAnimator:
     return loaded
 
 
-def solved(content: dict[str, Any], part: str, vertices: np.ndarray, temporal: float, term: float = 1.0) -> np.ndarray:
+def solved(content: dict[str, Any], part: str, vertices: np.ndarray, temporal: float = 0.01) -> np.ndarray:
     """NVIDIA's system of one part's shapes, by SciPy."""
     pose, params = content["poses"][part], content["poses"][part]["params"]
     used = np.flatnonzero(params["bsSolveActivePoses"])
@@ -59,7 +58,7 @@ def solved(content: dict[str, Any], part: str, vertices: np.ndarray, temporal: f
         a += s * 10 * params["strengthSymmetry"] * row.T @ row
     last, result = np.zeros(len(used)), np.zeros((len(vertices), len(params["bsSolveActivePoses"])))
     for t, pose_t in enumerate(vertices):
-        b = d.T @ (pose_t - pose["neutral"])[rows].ravel().astype(float) + s * temporal * term * last
+        b = d.T @ (pose_t - pose["neutral"])[rows].ravel().astype(float) + s * temporal * last
         upper = np.ones(len(used))
         last = lsq_linear(a, b, (np.zeros(len(used)), upper), method="bvls", tol=1e-14).x
         if part == "skin":
@@ -76,19 +75,7 @@ def test_solve_is_nvidias_with_the_folders_settings(
     part: Any,  # noqa: ANN401
 ) -> None:
     vertices = model.model.animate(model.model.infer(SPEECH, 30), 30)[f"{part}_vertices"]
-    np.testing.assert_allclose(model.solve(part, vertices), solved(content, part, vertices, 0.01), atol=1e-6)
-    np.testing.assert_allclose(model.solve(part, vertices, 0.0), solved(content, part, vertices, 0.0), atol=1e-6)
-    model.weights = replace(model.weights, temporal_term="corrected")
-    expected = solved(content, part, vertices, 0.01, term=100)
-    np.testing.assert_allclose(model.solve(part, vertices), expected, atol=1e-6)
-
-
-def test_facediffs_own_solver_recovers_weights(model: Audio2FaceAnimator, content: dict[str, Any]) -> None:
-    pose = content["poses"]["skin"]
-    weights = np.random.default_rng(0).random((5, len(POSES)))
-    vertices = (pose["neutral"] + np.tensordot(weights, pose["deltas"], 1)).astype(np.float32)
-    model.weights = replace(model.weights, solver="facediff")
-    np.testing.assert_allclose(model.solve("skin", vertices), weights, atol=2e-4)
+    np.testing.assert_allclose(model.solve(part, vertices), solved(content, part, vertices), atol=1e-6)
 
 
 def test_animate_gives_vertices_and_what_they_are_made_of(model: Audio2FaceAnimator) -> None:
