@@ -187,8 +187,6 @@ def test_acting_is_off_unless_it_is_asked_for_and_rests_in_silence(model: facedi
         facediff.Animation("x", plain.vertices, plain.template, 25.0, plain.faces).control(acting="prosody")
 
 
-
-
 def test_command_names_what_is_wrong_and_writes_nothing(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("keys.json").write_text(json.dumps({"keys": rows("brows", "high")}))
     command = ["animate", "speech.wav", "--checkpoint", "demo/puppet.ckpt", "-o", "b.npz", "--direction"]
