@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from facediff.animation.options import SourceOptions, Tracks
-from facediff.cli.options import FrameRate, Picture, check_source
+from facediff.cli.options import Picture, check_source
 from facediff.cli.parsing import changed
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, counted, refuse_idle
@@ -50,15 +50,11 @@ class TableOptions:
     Attributes:
         plain: columns time, the set's own names, residuals in mm
         tracks: oculus (15 visemes) or vrm (vowels and blinks) in place of the shapes' own weights, as a plain table
-        key_tolerance: the .json gets the keys of each curve that a straight line does not replace to within so much
-        csv_rate: rows a second, interpolated between the frames (default: a row for each frame)
         show: picture of the frame that the shapes fit worst
     """
 
     plain: bool = False
     tracks: Tracks = "arkit"
-    key_tolerance: Annotated[ranges.KeyTolerance, Option(metavar="W")] = 0.0
-    csv_rate: FrameRate = None
     show: Picture = None
 
 
@@ -119,9 +115,8 @@ def blendshapes(
     # Shapes without a column would take motion that the table then lacks: mouthOpen would take jawOpen's.
     only_arkit = weights.only_arkit or not table.plain
     shape_set, solved = solve_weights(motion, shapes, options, carry=weights.carry, only_arkit=only_arkit)
-    rows = solved if table.csv_rate is None else solved.at_rate(table.csv_rate)
-    rows = rows if table.tracks == "arkit" else rows.tracks(table.tracks)
-    rows.save(output, plain=plain, key_tolerance=table.key_tolerance)
+    rows = solved if table.tracks == "arkit" else solved.tracks(table.tracks)
+    rows.save(output, plain=plain)
     if table.show is not None:
         from facediff.export.pictures import draw_worst_frame
 

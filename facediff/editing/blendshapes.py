@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
-from facediff.editing.bounded import Problem, minimise, minimise_sparse
+from facediff.editing.bounded import MOST_STEPS, Problem, minimise, minimise_sparse
 from facediff.editing.controls.expressiveness import ALL, check_factors
 from facediff.editing.shapes import BUILT_IN, ShapeSet, read_shapes
 from facediff.errors import FaceDiffError, OptionError, check_known
@@ -33,6 +33,7 @@ CHUNK_BYTES = 32 * 2**20
 AROUND = 1 / 15  # Seconds before and after a shape's work in which it is free to fade
 VISIBLE_MM = 0.2  # A residual that nobody sees is none, however small the motion
 UNBOUNDED = 1e3  # More than a coefficient reaches, in standard deviations or weights
+TOLERANCE = 1e-8  # of the optimality conditions, in weights
 STATED_RATE = 30.0  # Frames a second for which the smoothness is stated
 
 
@@ -45,7 +46,8 @@ class SolveOptions:
             second keeps 98 % of its size. Stated for 30 frames a second and converted to the animation's frame rate.
         symmetry: how much a difference between the weights of a left shape and its right one costs.
         sparsity: how much of a weight a shape must gain by its work to be used in a frame: shapes that would cancel one
-            another stay at 0. With 0, all shapes are used; see :func:`minimise_sparse`.
+            another stay at 0. With 0, all shapes are used, and weights may be negative; see
+            :func:`minimise_sparse`.
         ridge: how much the squares of weights cost, which chooses the smallest among equally good ones.
         lower: least weight.
         upper: greatest weight.
@@ -54,8 +56,6 @@ class SolveOptions:
             without triangles, all count alike.
         residual_limit: largest residual as a share of the motion, root mean square over all frames; above it the shapes
             belong to another face. 1 or more allows everything.
-        tolerance: of the optimality conditions, in weights.
-        max_iterations: of Newton's method.
     """
 
     smoothness: ranges.Strength = 0.02
@@ -67,13 +67,13 @@ class SolveOptions:
     region: str | None = None
     area_weighted: bool = True
     residual_limit: ranges.Strength = 0.8
-    tolerance: ranges.Tolerance = 1e-8
-    max_iterations: ranges.Steps = 200
 
     def __post_init__(self) -> None:
         ranges.check_options(self)
         if not self.lower < self.upper:
             raise FaceDiffError(f"bounds {self.lower:g} to {self.upper:g}: expected the lower one first, as in 0 1")
+        if self.sparsity > 0 > self.lower:
+            raise FaceDiffError(f"bounds from {self.lower:g}: sparsity needs weights above 0; give a sparsity of 0")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -122,40 +122,6 @@ class Weights:
             return np.zeros_like(self.residual_rms_mm)
         return self.residual_rms_mm / self.amplitude_mm
 
-    @ranges.checked
-    def at_rate(self, frame_rate: ranges.FrameRate) -> Weights:
-        """The weights at another frame rate, interpolated linearly; residuals likewise, since nothing is solved again.
-
-        The last frame is the last one that does not lie after the motion's end.
-
-        Args:
-            frame_rate: frames a second.
-
-        Example:
-            >>> curve = Weights(("jawOpen",), np.array([[0.0], [1.0]]), np.zeros(2), np.zeros(2), 1.0, frame_rate=30.0)
-            >>> curve.at_rate(60.0).values.ravel().tolist()
-            [0.0, 0.5, 1.0]
-        """
-        old_times = np.arange(len(self.values)) / self.frame_rate
-        # The small share keeps a frame that rounding puts just after the end.
-        new_times = np.arange(int(old_times[-1] * frame_rate + 1e-6) + 1) / frame_rate
-
-        def interpolated(values: Array) -> Array:
-            return np.interp(new_times, old_times, values).astype(np.float64)
-
-        def columns(values: Array | None) -> Array | None:
-            return None if values is None else np.stack([interpolated(column) for column in values.T], axis=1)
-
-        return replace(
-            self,
-            values=np.stack([interpolated(values) for values in self.values.T], axis=1),
-            residual_rms_mm=interpolated(self.residual_rms_mm),
-            residual_max_mm=interpolated(self.residual_max_mm),
-            frame_rate=frame_rate,
-            head=columns(self.head),
-            eyes=columns(self.eyes),
-        )
-
     def arkit_columns(self, purpose: object) -> list[int]:
         """The columns with names of ARKit's; refused if there are none, for a purpose such as a file."""
         columns = [index for index, name in enumerate(self.names) if name in ARKIT]
@@ -174,28 +140,15 @@ class Weights:
         about = {**self.metadata, "tracks": viseme_set}
         return replace(self, names=target.channels, values=np.asarray(values, np.float64), still=(), metadata=about)
 
-    def curves(self, tolerance: float) -> dict[str, tuple[list[float], list[float]]]:
-        """Times in seconds and weights of the keys that are enough for each curve by itself, see :func:`key_frames`."""
-        curves = {}
-        for name, curve in zip(self.names, self.values.T, strict=True):
-            keys = key_frames(curve[:, None], tolerance)
-            times, weights = keys / self.frame_rate, curve[keys]
-            curves[name] = ([round(float(time), 6) for time in times], [round(float(one), 6) for one in weights])
-        return curves
-
-    @ranges.checked
-    def save(self, path: str | Path, *, plain: bool = False, key_tolerance: ranges.KeyTolerance = 0.0) -> Path:
+    def save(self, path: str | Path, *, plain: bool = False) -> Path:
         """Write the table, and a .json with further facts next to it.
 
         Args:
             path: the .csv file.
             plain: columns time, the set's own names and residuals in mm, instead of Live Link Face's columns.
-            key_tolerance: above 0, the .json gets the keys of each curve that a straight line does not replace to
-                within so much of a weight. The table has a row for each frame.
         """
-        path = Path(path)
-        (write_weights if plain else write_live_link)(path, self, key_tolerance)
-        return path
+        (write_weights if plain else write_live_link)(Path(path), self)
+        return Path(path)
 
     def __repr__(self) -> str:
         shares = self.residual_share
@@ -288,14 +241,12 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
     amplitude = float(np.sqrt(square / (len(animation.vertices) * len(moving.vertices))))
     scale = terms.scale
     problem = Problem(terms.matrix, right, terms.coupling, options.lower * scale, options.upper * scale)
-    tolerance = options.tolerance * scale
+    tolerance = TOLERANCE * scale
     if options.sparsity > 0:
         around = max(1, round(AROUND * animation.frame_rate))
-        scaled_weights, converged = minimise_sparse(
-            problem, options.sparsity * scale, tolerance, options.max_iterations, frames_around=around
-        )
+        scaled_weights, converged = minimise_sparse(problem, options.sparsity * scale, tolerance, frames_around=around)
     else:
-        scaled_weights, converged = minimise(problem, tolerance, options.max_iterations)
+        scaled_weights, converged = minimise(problem, tolerance)
     values = np.full((len(right), len(shapes.names)), np.clip(0.0, options.lower, options.upper))
     # Division may lead past a bound by a rounding error.
     values[:, moving.indices] = np.clip(scaled_weights / scale, options.lower, options.upper)
@@ -316,7 +267,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         "ridge": f"{options.ridge:g}",
         "bounds": f"{options.lower:g} {options.upper:g}",
         "region": options.region or "whole face",
-        "converged": "yes" if converged else f"no, after {options.max_iterations} iterations",
+        "converged": "yes" if converged else f"no, after {MOST_STEPS} iterations",
     }
     return Weights(
         names=shapes.names,
@@ -470,7 +421,7 @@ FORMAT = "facediff blendshape weights 1"
 SURELY_SIXTIETHS = 31 / 60  # A table with a row at this time is read as one of sixtieths
 
 
-def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:
+def write_live_link(path: Path, weights: Weights) -> None:
     """Write a table as Epic's app Live Link Face records it, and ``<name>.json`` next to it.
 
     A row for each frame: timecode, number of values (61), ARKit's 52 names in order, rotations of head and eyes, as
@@ -480,11 +431,6 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
 
     A table that ends before frame number 31 of a second gets one more row there, which holds the last frame: Unreal
     Engine's importer takes a table for one of 30 frames a second unless it finds a greater number than 30.
-
-    Args:
-        path: the table.
-        weights: the weights.
-        key_tolerance: as :meth:`Weights.save` takes it.
     """
     weights.arkit_columns(path)
     times = [frame / weights.frame_rate for frame in range(len(weights.values))]
@@ -500,7 +446,7 @@ def write_live_link(path: Path, weights: Weights, key_tolerance: float = 0.0) ->
         "timecode": "frames are sixtieths of a second with a fraction, whatever the frame rate",
         "rows_held": len(row_times) - len(times),
     }
-    _write_both(path, live_link_header(), rows, _about(weights, in_table=ARKIT, more=more, key_tolerance=key_tolerance))
+    _write_both(path, live_link_header(), rows, _about(weights, ARKIT, more))
 
 
 def live_link_values(weights: Weights) -> tuple[npt.NDArray[np.float32], list[str]]:
@@ -516,14 +462,8 @@ def live_link_values(weights: Weights) -> tuple[npt.NDArray[np.float32], list[st
     return np.concatenate([np.stack(shapes, axis=1), head, eyes], axis=1).astype(np.float32), unknown
 
 
-def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> None:
-    """Write a plain table and ``<name>.json`` next to it: time in seconds, every weight, residuals in millimetres.
-
-    Args:
-        path: the table.
-        weights: the weights.
-        key_tolerance: as :meth:`Weights.save` takes it.
-    """
+def write_weights(path: Path, weights: Weights) -> None:
+    """Write a plain table and ``<name>.json`` next to it: time in seconds, every weight, residuals in millimetres."""
     header = ["time", *weights.names, "residual_rms_mm", "residual_max_mm"]
     rows = (
         [
@@ -534,16 +474,11 @@ def write_weights(path: Path, weights: Weights, key_tolerance: float = 0.0) -> N
         ]
         for frame, values in enumerate(weights.values)
     )
-    _write_both(path, header, rows, _about(weights, in_table=weights.names, more={}, key_tolerance=key_tolerance))
+    _write_both(path, header, rows, _about(weights, weights.names, {}))
 
 
-def _about(
-    weights: Weights, *, in_table: Sequence[str], more: Mapping[str, object], key_tolerance: float
-) -> dict[str, object]:
+def _about(weights: Weights, in_table: Sequence[str], more: Mapping[str, object]) -> dict[str, object]:
     """The content of the .json next to a table."""
-    if key_tolerance > 0:
-        curves = {name: {"times": t, "values": v} for name, (t, v) in weights.curves(key_tolerance).items()}
-        more = {**more, "key_tolerance": key_tolerance, "curves": curves}
     return {
         "format": FORMAT,
         "frame_rate": weights.frame_rate,

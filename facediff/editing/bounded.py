@@ -19,6 +19,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 ACTIVE = 1e-3  # Share of the cost of a weight above which a shape is at work
+MOST_STEPS = 200  # of any of the solvers
 
 # A box-bounded quadratic program over all frames, solved by projected Newton steps. scipy's bounded solvers either know
 # no banded matrices or stop far from the 1e-8 that is promised for weights; its banded Cholesky solver takes the steps.
@@ -61,47 +62,27 @@ class Problem:
         return np.abs(x - self.clip(x - self.gradient(x)))
 
 
-def minimise_sparse(
-    problem: Problem, cost: Array, tolerance: Array, max_iterations: int, *, frames_around: int
-) -> tuple[Array, bool]:
-    """The box's point of least value with few shapes at work in each frame.
+def minimise_sparse(problem: Problem, cost: Array, tolerance: Array, *, frames_around: int) -> tuple[Array, bool]:
+    """The box's point of least value with few shapes at work in each frame; bounds are not negative.
 
-    The sum Σ_t Σ_k cost_k |x_tk| is added to the objective, which keeps shapes at 0 that gain less than they cost. It
+    The sum Σ_t Σ_k cost_k x_tk is added to the objective, which keeps shapes at 0 that gain less than they cost. It
     also takes something from all others. The second problem, without the sum and with those shapes held at 0, gives it
     back (Meinshausen, "Relaxed Lasso", Computational Statistics & Data Analysis 2007).
 
     Returns:
         x (T, K), and whether the residual of the second problem meets the tolerance (K,).
     """
-    sparse = minimise_sum(problem, cost, tolerance, max_iterations)
+    sparse = minimise(replace(problem, right=problem.right - cost), tolerance)[0]
     # A shape that is at work in a frame is free in those around it, or its curve would begin and end with a jump.
     window = np.lib.stride_tricks.sliding_window_view
-    reach = np.pad(np.abs(sparse) > ACTIVE * cost, ((frames_around, frames_around), (0, 0)))
+    reach = np.pad(sparse > ACTIVE * cost, ((frames_around, frames_around), (0, 0)))
     active = window(reach, 2 * frames_around + 1, axis=0).any(axis=-1)
     lower = np.where(active, problem.lower, np.clip(0.0, problem.lower, problem.upper))
     upper = np.where(active, problem.upper, np.clip(0.0, problem.lower, problem.upper))
-    return minimise(replace(problem, lower=lower, upper=upper), tolerance, max_iterations)
+    return minimise(replace(problem, lower=lower, upper=upper), tolerance)
 
 
-def minimise_sum(problem: Problem, cost: Array, tolerance: Array, max_iterations: int) -> Array:
-    """The solution with Σ_t Σ_k cost_k |x_tk| added to the objective, (T, K)."""
-    if (problem.lower >= 0).all():
-        return minimise(replace(problem, right=problem.right - cost), tolerance, max_iterations)[0]
-    # Where weights have both signs, each is a positive part less a negative one, and the sum of both is its size.
-    parts = Problem(
-        np.block([[problem.matrix, -problem.matrix], [-problem.matrix, problem.matrix]]),
-        np.concatenate([problem.right - cost, -problem.right - cost], axis=1),
-        problem.coupling,
-        np.maximum(np.concatenate([problem.lower, -problem.upper]), 0.0),
-        np.maximum(np.concatenate([problem.upper, -problem.lower]), 0.0),
-    )
-    # The cost makes it pay to have one of both parts only; where rounding leaves some of both, the difference counts.
-    solution, _ = minimise(parts, np.concatenate([tolerance, tolerance]), max_iterations)
-    positive, negative = np.split(solution, 2, axis=1)
-    return positive - negative
-
-
-def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[Array, bool]:
+def minimise(problem: Problem, tolerance: Array) -> tuple[Array, bool]:
     """The box's point of least value.
 
     Bertsekas, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 1982:
@@ -116,7 +97,7 @@ def minimise(problem: Problem, tolerance: Array, max_iterations: int) -> tuple[A
     x = problem.clip(_newton(problem, problem.right, np.ones(problem.right.shape, bool)))
     widths = problem.upper - problem.lower
     width = float(widths[widths > 0].min(initial=1.0))
-    for _ in range(max_iterations):
+    for _ in range(MOST_STEPS):
         left = problem.residual(x)
         if (left <= tolerance).all():
             return x, True
@@ -198,7 +179,6 @@ class Pivoting:
 
     Args:
         matrix: M (K, K), symmetric, positive semi-definite, with a diagonal of about one.
-        max_iterations: exchanges for one r.
 
     Example:
         >>> solver = Pivoting(np.array([[1.0, 0.5], [0.5, 1.0]]))
@@ -206,25 +186,18 @@ class Pivoting:
         [1.0, 0.0]
     """
 
-    def __init__(self, matrix: Array, max_iterations: int = 200) -> None:
+    def __init__(self, matrix: Array) -> None:
         self.matrix = matrix
-        self.max_iterations = max_iterations
         # Positive definite, so that the solution is one, also where shapes depend on one another.
         self._solvable = matrix + JITTER * np.eye(len(matrix))
         self._inverses: OrderedDict[bytes, Array] = OrderedDict()
         self._side = np.zeros(len(matrix), np.int8)  # -1 on the lower bound, 1 on the upper one, 0 between them
 
     def solve(self, right: Array, lower: Array, upper: Array) -> Array:
-        """The point (K,) of least value; a variable with equal bounds stays there.
-
-        Args:
-            right: r (K,).
-            lower: least values (K,).
-            upper: greatest values (K,).
-        """
+        """The point (K,) of least value for r (K,) and bounds (K,); a variable with equal bounds stays there."""
         side = np.where(upper <= lower, -1, self._side).astype(np.int8)
         fewest, patience = len(side) + 1, PATIENCE
-        for _ in range(self.max_iterations):
+        for _ in range(MOST_STEPS):
             x = self._at(side, right, lower, upper)
             slope = self.matrix @ x - right
             below, above = (side == 0) & (x < lower - MISSED), (side == 0) & (x > upper + MISSED)
@@ -243,7 +216,10 @@ class Pivoting:
                 wrong = wrong[-1:]
             changed = np.where(below, -1, np.where(above, 1, 0)).astype(np.int8)
             side[wrong] = changed[wrong]
-        return self._carefully(right, lower, upper)
+        problem = Problem(self.matrix, right[None], 0.0, lower, upper)
+        solution: Array = minimise(problem, np.full(len(right), MISSED))[0][0]
+        self._side = np.where(solution <= lower, -1, np.where(solution >= upper, 1, 0)).astype(np.int8)
+        return solution
 
     def _at(self, side: npt.NDArray[np.int8], right: Array, lower: Array, upper: Array) -> Array:
         """The variables on a bound there, and the others where their slope is zero."""
@@ -267,12 +243,6 @@ class Pivoting:
         solution = inverse @ goal
         x[inner] = solution + inverse @ (goal - block @ solution)  # once more against rounding
         return x
-
-    def _carefully(self, right: Array, lower: Array, upper: Array) -> Array:
-        problem = Problem(self.matrix, right[None], 0.0, lower, upper)
-        solution = minimise(problem, np.full(len(right), MISSED), self.max_iterations)[0][0]
-        self._side = np.where(solution <= lower, -1, np.where(solution >= upper, 1, 0)).astype(np.int8)
-        return solution
 
 
 # Of a system A x = b as it is. The quadratic program of its normal equations has the square of A's condition, which

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.editing.blendshapes import AROUND, SolveOptions, moving_shapes, objective
-from facediff.editing.bounded import ACTIVE, Pivoting, Problem, minimise_sum
+from facediff.editing.bounded import ACTIVE, Pivoting
 from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
@@ -66,7 +66,7 @@ class FrameSolver:
         self._lower, self._upper = options.lower * terms.scale, options.upper * terms.scale
         self._rest = np.clip(np.zeros(len(terms.scale)), self._lower, self._upper)
         self._cost = options.sparsity * terms.scale
-        self._sum, self._final = (Pivoting(matrix, options.max_iterations) for _ in range(2))
+        self._sum, self._final = Pivoting(matrix), Pivoting(matrix)
         self._fading = max(1, round(AROUND * frame_rate))
         # Vertices that no shape moves add nothing to a product.
         moved = (terms.projection.reshape(len(matrix), -1, 3) != 0).any(axis=(0, 2))
@@ -96,7 +96,7 @@ class FrameSolver:
         right += self._coupling * self._last
         lower, upper = self._lower, self._upper
         if self.options.sparsity > 0:
-            at_work = np.abs(self._least_sum(right)) > ACTIVE * self._cost
+            at_work = self._sum.solve(right - self._cost, lower, upper) > ACTIVE * self._cost
             self._idle = np.where(at_work, 0, self._idle + 1)
             resting = self._idle > self._fading
             lower, upper = np.where(resting, self._rest, lower), np.where(resting, self._rest, upper)
@@ -105,13 +105,6 @@ class FrameSolver:
         # Division may lead past a bound by a rounding error.
         weights[self._moving.indices] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
         return weights
-
-    def _least_sum(self, right: Array) -> Array:
-        """The solution with the cost of shapes added to the objective."""
-        if (self._lower >= 0).all():
-            return self._sum.solve(right - self._cost, self._lower, self._upper)
-        problem = Problem(self._sum.matrix, right[None], 0.0, self._lower, self._upper)
-        return minimise_sum(problem, self._cost, self.options.tolerance * self._scale, self.options.max_iterations)[0]
 
     def residual_mm(self, offsets: npt.NDArray[np.floating], weights: Array) -> float:
         """Root-mean-square distance over the vertices that count that weights (K,) leave of offsets (V, 3), in mm."""

@@ -78,7 +78,7 @@ class BlendshapeWeights(Format):
     needs_shapes = True
     units = "none"
     up_axes = ()
-    uses = ("shapes", "tracks", "key_tolerance")
+    uses = ("shapes", "tracks")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Solve for the weights and write them, with a .json file that says how well they fit."""
@@ -86,7 +86,7 @@ class BlendshapeWeights(Format):
         weights = _arkit_weights(animation, options)
         if options.tracks != "arkit":
             weights = weights.tracks(options.tracks)
-        weights.save(path, plain=options.tracks != "arkit", key_tolerance=options.key_tolerance)
+        weights.save(path, plain=options.tracks != "arkit")
 
     def companions(self, path: Path, animation: Animation) -> list[Path]:
         """The .json file."""

@@ -112,20 +112,6 @@ def test_the_picture_of_the_worst_frame_leaves_the_heads_motion_out(
     assert f"0 to {weights.residual_max_mm[weights.residual_rms_mm.argmax()]:.2g} mm" in residual.label
 
 
-def test_rows_at_another_rate_lie_on_the_curve(
-    folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path
-) -> None:
-    out = tmp_path / "weights.csv"
-    words = ["blendshapes", str(archive), "-o", str(out), "--shapes", str(folder), "--smoothness", "0", "--plain"]
-    assert main([*words, "--csv-rate", "50"]) == 0
-    table = np.genfromtxt(out, delimiter=",", names=True)
-    for name, weights in known.items():
-        assert table["time"][::2] == pytest.approx(np.arange(len(weights)) / 25)
-        assert table[name][::2] == pytest.approx(weights, abs=1e-3)
-        assert table[name][1::2] == pytest.approx((weights[1:] + weights[:-1]) / 2, abs=1e-3)
-    assert main([*words, "--csv-rate", "0"]) == 2
-
-
 def test_shapes_of_another_topology_are_carried(
     folder: Path, archive: Path, known: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

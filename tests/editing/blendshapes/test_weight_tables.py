@@ -12,7 +12,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from facediff.editing.blendshapes import Weights, live_link_values, write_live_link, write_weights
-from facediff.errors import FaceDiffError
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import read_parameters
 from facediff.spaces.files.csv_files import timecode
@@ -131,15 +130,3 @@ def test_unreal_reads_every_frame_at_its_time(
     # A table that would be taken for one of 30 frames a second is held until it cannot be.
     assert len(rows) - frames == json.loads((tmp_path / "a.json").read_text())["rows_held"] <= 1
     assert {row["JawOpen"] for row in rows[frames - 1 :]} == {rows[frames - 1]["JawOpen"]}
-
-
-def test_another_rate_keeps_the_curve(weights: Weights) -> None:
-    resampled = weights.at_rate(60.0)
-    assert len(resampled.values) == 2 * 70 - 1
-    assert resampled.values[::2] == pytest.approx(weights.values)
-    assert resampled.values[1::2] == pytest.approx((weights.values[1:] + weights.values[:-1]) / 2)
-    assert resampled.residual_rms_mm[::2] == pytest.approx(weights.residual_rms_mm)
-    slower = weights.at_rate(25.0)
-    assert (len(slower.values) - 1) / 25 <= 69 / 30 < len(slower.values) / 25
-    with pytest.raises(FaceDiffError, match="frame_rate"):
-        weights.at_rate(0.0)
