@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +31,8 @@ class Manifest:
     corpus: ShortText = ""
     person: ShortText = ""
     unit: ShortText = ""
+    files: Mapping[str, Any] = field(default_factory=dict)
+    failed: Mapping[str, Any] = field(default_factory=dict)
 
 
 def load_manifest(path: Path, *, remedy: str = REMEDY) -> dict[str, Any]:

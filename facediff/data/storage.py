@@ -87,7 +87,11 @@ class ClipFolder:
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the clip's .wav file; see :func:`~facediff.speech.audio.read_stretch`."""
-        return read_stretch(find_file(self.root / "wav" / f"{name}.wav"), first, length, store, self._complete)
+        return read_stretch(self.sound_path(name), first, length, store, self._complete)
+
+    def sound_path(self, name: str) -> Path:
+        """The file with a clip's speech."""
+        return find_file(self.root / "wav" / f"{name}.wav")
 
     def version(self, name: str) -> object:
         """Size and time of the clip's motion file."""

@@ -2,54 +2,36 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from facediff.data.check.clip import LENGTHS, ClipFiles, ClipInfo, Rules, examine, is_about
+import numpy as np
+
+from facediff.data.check.clip import LENGTHS, ClipInfo, Rules, examine, is_about
 from facediff.data.check.findings import FEW, CheckReport, Findings, few
-from facediff.data.check.layouts import (
-    MANIFEST,
-    SPLITS,
-    STATE,
-    CorpusFolder,
-    CorpusView,
-    identify,
-    is_rate,
-    list_folder,
-    list_packed,
-    manifest_in,
-)
-from facediff.data.check.packed import check_packed, examine_packed
+from facediff.data.check.layouts import MANIFEST, CorpusFolder, CorpusView, identify, list_folder, list_packed
 from facediff.data.check.recordings import check_recordings, parametric_module, refuse_layout
-from facediff.data.check.shared import (
-    check_account,
-    check_areas,
-    check_ended,
-    check_files,
-    check_mesh,
-    check_pairs,
-    check_regions,
-    check_templates,
-)
+from facediff.data.check.shared import check_areas, check_files, check_mesh, check_regions, check_templates
+from facediff.data.manifest import read_manifest
 from facediff.data.packed.stores import is_packed
+from facediff.data.storage import ClipFolder
 from facediff.errors import FaceDiffError, counted, number
 from facediff.utils.jobs import is_cluster, run_tasks
 from facediff.utils.workers import WorkerDied, processors
 
 if TYPE_CHECKING:
-    from facediff.data.corpus import Clip, Corpus
+    from facediff.data.corpus import Clip
+    from facediff.data.packed.reader import PackedCorpus
 
 WORTH_IT = 64 << 20
 """From so many bytes of motion on, starting processes pays."""
 REFERENCES = "none"
 """The split of clips that give style references only."""
-
-
+SPLITS = ("train", "val", "test_a", "test_b", "test_c")
 NEVER_RECORDED = 0.05
 """Share of a split that may be missing of these without a warning; the true number is not published."""
 
@@ -73,47 +55,35 @@ def check(
         scheduler: where clips are read; see :func:`facediff.utils.jobs.run_tasks`.
         progress: show a progress bar on standard error.
     """
-    packed = None
+    packed: PackedCorpus | None = None
     if is_packed(root):
         from facediff.data.packed.reader import PackedCorpus
 
         packed = PackedCorpus(root)
-    source: Path | str = Path(root).expanduser() if packed is None else packed.source
-    root = Path(root).expanduser() if packed is None else packed.folder
-    if not root.is_dir():
-        raise FaceDiffError(f"{root}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
-    from facediff.data.corpus import MOTION_FOLDERS
-
-    report = CheckReport(source, quick)
-    manifest = manifest_in(root, MANIFEST, report.findings)
-    state = manifest_in(root, STATE, report.findings)
+    folder = Path(root).expanduser() if packed is None else packed.folder
+    if not folder.is_dir():
+        raise FaceDiffError(f"{folder}: no such folder; expected a corpus with wav/, vertices_npy/ and templates.pkl")
     refuse_layout(corpus)
-    module = parametric_module(root, corpus, manifest) if packed is None else None
-    if module is not None:
-        check_recordings(report, root, module, corpus)
-        report.sort()
+    report = CheckReport(folder if packed is None else packed.source, quick)
+    manifest: dict[str, Any] = {}
+    with report.findings.guard("manifest_unreadable", folder / MANIFEST, folder):
+        manifest = read_manifest(folder)
+    if report.findings:
         return report
-    folder = list_folder(root, MOTION_FOLDERS) if packed is None else list_packed(packed)
-    recorded = manifest.get("corpus", state.get("corpus") if packed is None else packed.record.corpus)
-    view = identify(folder, recorded, corpus, manifest, report.findings)
-    report.manifest = {
-        "there": (root / MANIFEST).is_file(),
-        "ended": check_ended(root, recorded if isinstance(recorded, str) else None, report.findings),
-        "facediff": str(manifest["facediff"]) if "facediff" in manifest else None,
-        "changed": [],
-        "missing": [],
-    }
+    module = parametric_module(folder, corpus, manifest) if packed is None else None
+    if module is not None:
+        check_recordings(report, folder, module, corpus)
+        return report.sorted()
+    listed = list_folder(folder) if packed is None else list_packed(packed)
+    view: CorpusView | None = None
+    # A corpus that the user names and that is not known is wrong usage, and no finding.
+    with report.findings.guard("unrecognised", folder, folder) if corpus is None else nullcontext():
+        recorded = manifest.get("corpus") or (None if packed is None else packed.record.corpus)
+        view = identify(listed, {**manifest, "corpus": recorded}, corpus)
     if view is not None:
-        if packed is None:
-            size = sum(path.stat().st_size for path in folder.motions.values() if path.is_file())
-        else:
-            size = sum(sum(array.shards) for array in packed.record.arrays.values())
-        if not is_cluster(scheduler):
-            workers = workers or (1 if quick or size <= WORTH_IT else processors())
-        examine_all = partial(_examine_all, workers=workers, scheduler=scheduler, progress=progress)
-        _check_corpus(report, view, folder, manifest, examine_all)
-    report.sort()
-    return report
+        options = {"workers": workers, "scheduler": scheduler, "progress": "clips" if progress else ""}
+        _check_corpus(report, view, listed, manifest, packed, options)
+    return report.sorted()
 
 
 def _check_corpus(
@@ -121,149 +91,139 @@ def _check_corpus(
     view: CorpusView,
     folder: CorpusFolder,
     manifest: dict[str, Any],
-    examine_all: Callable[[Rules, CorpusView, CorpusFolder], list[ClipInfo]],
+    packed: PackedCorpus | None,
+    options: dict[str, Any],
 ) -> None:
-    from facediff.data.corpus import Corpus
+    from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS, Corpus, read_clip_table
 
     root, findings = folder.root, report.findings
     report.corpus, report.data_module = view.corpus, view.data_module
     report.frame_rate, report.n_vertices = view.frame_rate, view.n_vertices
-    opened: Corpus | None = None
-    # Opening the folder would fail for these reasons again.
-    if not any(finding.where == MANIFEST or finding.kind == "unfinished" for finding in findings):
-        with findings.guard("frame_rate", root / MANIFEST, root):
-            opened = Corpus(
-                root,
-                view.n_vertices,
-                view.frame_rate,
-                stored_frame_rate=view.stored_frame_rate,
-                parse=view.parse,
-                storage=folder.packed,
-            )
-    rate = manifest.get("frame_rate")
-    stored = report.stored_frame_rate = rate if is_rate(rate) else view.stored_frame_rate
+    stored = report.stored_frame_rate = float(manifest.get("frame_rate") or view.stored_frame_rate)
+    there, writer = (root / MANIFEST).is_file(), manifest.get("facediff")
+    ended = there or not (root / "prepare.json").is_file()
+    report.manifest |= {"there": there, "ended": ended, "facediff": None if writer is None else str(writer)}
+    opened: Any = None  # where the folder cannot be opened
+    with findings.guard("frame_rate" if ended else "unfinished", root / MANIFEST, root):
+        arguments: dict[str, Any] = {"stored_frame_rate": view.stored_frame_rate, "parse": view.parse}
+        opened = Corpus(root, view.n_vertices, view.frame_rate, storage=packed, **arguments)
+    if opened is None:
+        return
     templates, report.templates = check_templates(root, view, findings)
-    faces, report.mesh = check_mesh(root, view, findings)
+    faces, report.mesh = check_mesh(opened, view, findings)
     if faces is not None:
         report.templates["areas"] = check_areas(view, manifest.get("unit"), templates, faces, findings)
     report.regions = check_regions(root, view, findings)
-    if opened is not None:
-        check_pairs(opened, findings)
-    clips = _clips(opened, view, folder, findings)
+    for file in (LIP_PAIRS, EYELID_PAIRS):
+        with findings.guard("region_broken", root / file, root):
+            opened.read_pairs(file)
+    clips: dict[str, Clip] = {}
+    with findings.guard("clips_table", root / "clips.csv", root):
+        rows = read_clip_table(root)
+        if unknown := sorted(rows.keys() - set(folder.names)):
+            message = f"has rows of clips that are not here: {few(unknown)}; a misspelt name loses its attributes"
+            findings.note("clips_table", "clips.csv", message)
+        with findings.guard("no_clip", root, root):
+            clips = opened.clips
     _check_names(view, folder, clips, findings)
-    _check_both_files(view, folder, findings)
-    if not clips:
-        message = f"no clip of {view.corpus} with both wav/<clip>.wav and vertices_npy/<clip>.npy; put them there"
-        findings.error("no_clip", "wav, vertices_npy", message)
-
-    facts = examine_all(Rules(root, view.n_vertices, stored, templates, report.quick), view, folder)
+    if report.templates["file"]:
+        _check_subjects(clips, {*templates, *report.templates["broken"]}, findings)
+    storage = packed or ClipFolder(root, view.n_vertices)
+    rules = Rules(root, storage, view.n_vertices, stored, templates, report.quick)
+    fits = packed is None or _check_packed(packed, rules, findings)
+    facts = _examine_all(rules, folder, clips.values(), **options) if fits else []
     rate_fits = _check_frame_rate(view, stored, facts, findings, recorded="frame_rate" in manifest)
     for clip in facts:
         # Where the frame rate is wrong, every clip has the wrong length: one finding is enough.
         findings += [finding for finding in clip.findings if rate_fits or finding.kind not in LENGTHS]
-    _check_vertex_counts(facts, findings)
-    _check_sound_forms(facts, findings)
     _check_copies(facts, findings)
-    if report.templates["file"]:
-        _check_subjects(clips, {*templates, *report.templates["broken"]}, findings)
-    if folder.packed is not None:
-        check_packed(folder.packed, view.n_vertices, templates, findings)
-        files = manifest.get("files")
-        if isinstance(files, dict):  # of which motion and speech are no files any more
-            manifest = {
-                **manifest,
-                "files": {name: files[name] for name in files if name in folder.packed.record.files},
-            }
+    files = manifest.get("files", {})
+    if packed is not None:  # motion and speech are no files any more
+        files = {name: files[name] for name in files if name in packed.record.files}
     hashes = {where: digest for clip in facts for where, digest in clip.hashes.items()}
-    report.manifest |= check_files(root, manifest, hashes, findings, quick=report.quick)
-    check_account(manifest, findings)
+    report.manifest |= check_files(root, files, hashes, findings, quick=report.quick)
+    if failed := manifest.get("failed"):
+        name, reason = next(iter(failed.items()))
+        message = f"{counted(len(failed), 'clip')} could not be prepared, the first: {name}: {reason}"
+        findings.warning("prepare_failed", MANIFEST, message)
     stride = max(1, round(stored / view.frame_rate))
     frames = {clip.name: -(-clip.frames // stride) for clip in facts if clip.frames is not None}
     report.splits = _count_splits(view, clips, frames, findings)
     report.subjects = _count_subjects(view, clips, frames, templates)
 
 
-def _clips(opened: Corpus | None, view: CorpusView, folder: CorpusFolder, findings: Findings) -> dict[str, Clip]:
-    """The clips that training would read; by their names alone if the folder cannot be opened."""
-    names = [name for name in folder.names if name in folder.motions and name in folder.sounds]
-    clips = {name: clip for name in names if (clip := view.parse(name)) is not None}
-    if opened is not None and clips:
-        with findings.guard("clips_table", folder.root / "clips.csv", folder.root):
-            read = opened.clips
-            clips = {name: read.get(name, clip) for name, clip in clips.items()}
-            from facediff.data.corpus import read_clip_table
-
-            if unknown := sorted(set(read_clip_table(folder.root)) - set(folder.names)):
-                message = f"has rows of clips that are not here: {few(unknown)}; a misspelt name loses its attributes"
-                findings.note("clips_table", "clips.csv", message)
-    return clips
+def _check_packed(packed: PackedCorpus, rules: Rules, findings: Findings) -> bool:
+    """Whether a packed corpus has the recognised topology; compares its templates with ``templates.pkl``."""
+    record = packed.record
+    if record.n_vertices != rules.n_vertices:
+        message = f"was packed with {record.n_vertices} vertices, expected {rules.n_vertices}; give --corpus"
+        findings.error("motion_shape", packed.source, message)
+        return False
+    with findings.guard("templates_unreadable", Path("templates"), Path(packed.source)):
+        for name, face in packed.templates().items():
+            if name in rules.templates and not np.array_equal(face, rules.templates[name]):
+                message = f"the packed face of {name} differs from templates.pkl; pack the corpus again"
+                findings.error("template_differs", f"templates:{name}", message)
+        quality = "lossless" if not record.tolerance else f"coordinates within {record.tolerance:g} mm"
+        findings.note("packed", packed.source, f"is packed, {quality}; made by facediff {record.made_by}")
+    return True
 
 
 def _examine_all(
-    rules: Rules, view: CorpusView, folder: CorpusFolder, *, workers: int | None, scheduler: str | None, progress: bool
+    rules: Rules,
+    folder: CorpusFolder,
+    clips: Iterable[Clip],
+    *,
+    workers: int | None,
+    scheduler: str | None,
+    progress: str,
 ) -> list[ClipInfo]:
-    tasks = [
-        ClipFiles(name, clip.identity, folder.motions.get(name), folder.sounds.get(name))
-        for name in folder.names
-        if (clip := view.parse(name)) is not None
-    ]
+    reads = [folder.root]
+    if isinstance(rules.storage, ClipFolder):
+        size = sum(path.stat().st_size for path in folder.motions.values())
+    else:
+        reads, size = rules.storage.folders, sum(sum(array.shards) for array in rules.storage.record.arrays.values())
+    if not is_cluster(scheduler):
+        workers = workers or (1 if rules.quick or size <= WORTH_IT else processors())
+    tasks = [(clip.name, clip.identity) for clip in clips]
     examined: dict[str, ClipInfo] = {}
-    work: Any = partial(examine, rules) if folder.packed is None else partial(examine_packed, rules, folder.packed)
-    results = run_tasks(
-        work,
-        tasks,
-        workers=workers,
-        scheduler=scheduler,
-        reads=[folder.root] if folder.packed is None else folder.packed.folders,
-        progress="clips" if progress else "",
-    )
-    with closing(results):
-        for task, facts in results:
+    work = partial(examine, rules)
+    with closing(
+        run_tasks(work, tasks, workers=workers, scheduler=scheduler, reads=reads, progress=progress)
+    ) as results:
+        for (name, _), facts in results:
             if isinstance(facts, WorkerDied):
-                facts = ClipInfo(task.name)
+                facts = ClipInfo(name)
                 message = "killed the process that read it: badly damaged, or too little memory; get its files again"
-                facts.findings.error("clip_unreadable", task.name, message)
-            examined[task.name] = facts
-    return [examined[task.name] for task in tasks]
+                facts.findings.error("clip_unreadable", name, message)
+            examined[name] = facts
+    return [examined[name] for name, _ in tasks]
 
 
 # Findings about names and pairs of files.
 
 
 def _check_names(view: CorpusView, folder: CorpusFolder, clips: Mapping[str, Clip], findings: Findings) -> None:
-    """Report names not of the corpus's form, subjects in no split, and files that are not read."""
+    """Report names not of the corpus's form, subjects in no split, and files without their partner."""
     unknown = [name for name in folder.names if view.parse(name) is None]
     if unknown:
         message = f"{counted(len(unknown), 'name')} not of {view.corpus}'s form, so not read: {few(unknown)}"
         findings.warning("unknown_name", "wav, vertices_npy", message)
-    if foreign := _without_split(view, clips):
+    identities = set(view.identities)
+    identities |= {clip.identity for names in view.expected.values() for name in names if (clip := view.parse(name))}
+    identities |= {c.identity for c in clips.values() if any(split_of(c) for split_of in view.split_of.values())}
+    if foreign := [name for name, clip in clips.items() if clip.identity not in identities]:
         subjects = dict.fromkeys(clips[name].identity for name in foreign)
         message = (
             f"{counted(len(foreign), 'clip')} of subjects in no split of {view.corpus} ({few(subjects)}), so "
             f"not trained or scored on: {few(foreign)}"
         )
         findings.warning("unknown_subject", "wav, vertices_npy", message)
-    if folder.leftovers:
-        message = f"{counted(len(folder.leftovers), 'file')} half-written by a program that was stopped; remove them"
-        findings.warning("leftover", folder.leftovers[0], message)
-
-
-def _without_split(view: CorpusView, clips: Mapping[str, Clip]) -> list[str]:
-    """Clips of subjects that are in none of the corpus's splits."""
-    identities = set(view.identities)
-    identities |= {clip.identity for names in view.expected.values() for name in names if (clip := view.parse(name))}
-    for clip in clips.values():
-        if any(split_of(clip) is not None for split_of in view.split_of.values()):
-            identities.add(clip.identity)
-    return [name for name, clip in clips.items() if clip.identity not in identities]
-
-
-def _check_both_files(view: CorpusView, folder: CorpusFolder, findings: Findings) -> None:
     for files, partners, fault, kind in (
         (folder.sounds, folder.motions, "speech without motion", "motion_missing"),
         (folder.motions, folder.sounds, "motion without speech", "sound_missing"),
     ):
-        for name in sorted(name for name in files if name not in partners and view.parse(name) is not None):
+        for name in sorted(files.keys() - partners.keys() - set(unknown)):
             findings.warning(kind, name, f"{fault}, so not used; get the other file or remove this one")
 
 
@@ -279,24 +239,7 @@ def _check_subjects(clips: Mapping[str, Clip], with_template: set[str], findings
         findings.error("template_missing", "templates.pkl", message)
 
 
-# Findings about all clips together: topology, form of the speech, frame rate, copies.
-
-
-def _check_vertex_counts(facts: Iterable[ClipInfo], findings: Findings) -> None:
-    counts = Counter(clip.n_vertices for clip in facts if clip.n_vertices is not None)
-    if len(counts) > 1:
-        numbers = ", ".join(f"{number(count)} ({counted(clips, 'clip')})" for count, clips in counts.most_common())
-        message = f"motions of several topologies are mixed: vertices {numbers}; keep one corpus to a folder"
-        findings.error("mixed_vertex_counts", "vertices_npy", message)
-
-
-def _check_sound_forms(facts: Iterable[ClipInfo], findings: Findings) -> None:
-    forms = Counter((clip.sample_rate, clip.channels) for clip in facts if clip.sample_rate is not None)
-    for (rate, channels), count in forms.most_common():
-        if (rate, channels) != (16_000, 1):
-            form = f"{number(rate or 0)} Hz, {counted(channels or 0, 'channel')}"
-            message = f"{counted(count, 'file')} with {form}; read as 16 000 Hz mono, decoded once, then cached"
-            findings.note("sound_form", "wav", message)
+# Findings about all clips together: frame rate, copies.
 
 
 def _check_frame_rate(
@@ -326,13 +269,10 @@ def _check_copies(facts: Iterable[ClipInfo], findings: Findings) -> None:
         for where, digest in clip.hashes.items():
             names.setdefault(f"{digest}{where[-4:]}", []).append(where)
     for where, *copies in names.values():
-        same = f"holds the same bytes as {', '.join(copies[:FEW])}{' …' if len(copies) > FEW else ''}: one of them"
-        if copies and where.endswith(".npy"):
-            message = f"{same} is a copy under a wrong name; get it again or remove it"
-            findings.error("motion_copied", where, message)
-        elif copies:
-            message = f"{same} may have a wrong name; compare it with its source"
-            findings.warning("sound_copied", where, message)
+        if copies:
+            same = f"{', '.join(copies[:FEW])}{' …' if len(copies) > FEW else ''}"
+            message = f"holds the same bytes as {same}: one of them has a wrong name; get it again or remove it"
+            (findings.error if where.endswith(".npy") else findings.warning)("copy", where, message)
 
 
 # Counting clips, frames and seconds by split and by subject, and missing clips.

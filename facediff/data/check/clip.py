@@ -9,19 +9,21 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.data.check.findings import Findings, relative
-from facediff.data.storage import open_motion, rig_path
+from facediff.data.storage import ClipFolder, ClipMotion
 from facediff.errors import FaceDiffError
-from facediff.speech.audio import CUT, SAMPLE_RATE, cut_short, open_sound, read_speech
-from facediff.utils.arrays import open_array, vertices_of
+from facediff.speech.audio import SAMPLE_RATE, open_sound, read_speech, refuse_cut_short
 from facediff.utils.checksums import sha256
 
-CHUNK = 16  # frames that are read at a time
+if TYPE_CHECKING:
+    from facediff.data.packed.reader import PackedCorpus
+
+BLOCK = 64  # frames that are read at a time
 SAMPLED = 16  # frames, evenly spread, whose distance from the template is measured
 STILL = 1e-6
 """A clip moves if some coordinate changes by more than this share of the face's size."""
@@ -42,20 +44,11 @@ Array = npt.NDArray[np.floating]
 
 
 @dataclass(frozen=True)
-class ClipFiles:
-    """The files of one clip; None for one that is not there."""
-
-    name: str
-    subject: str
-    motion: Path | None
-    sound: Path | None
-
-
-@dataclass(frozen=True)
 class Rules:
-    """The expected properties of every clip, and whether headers only are read (``quick``)."""
+    """Where clips lie, the expected properties of every clip, and whether headers only are read (``quick``)."""
 
     root: Path
+    storage: ClipFolder | PackedCorpus
     n_vertices: int
     stored_frame_rate: float
     templates: Mapping[str, Array]
@@ -68,118 +61,71 @@ class ClipInfo:
 
     name: str
     frames: int | None = None  # on disk
-    n_vertices: int | None = None
     seconds: float | None = None  # of speech
-    sample_rate: int | None = None
-    channels: int | None = None
     hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 by file; empty where headers only are read
     findings: Findings = field(default_factory=Findings)
 
 
-def examine(rules: Rules, clip: ClipFiles) -> ClipInfo:
-    """Check one clip; every exception becomes a finding."""
-    info = ClipInfo(clip.name)
-    try:
-        if clip.motion is not None:
-            _check_motion(info, rules, clip.motion, clip.subject)
-        if clip.sound is not None:
-            _check_sound(info, rules, clip.sound)
-        if info.frames is not None and info.seconds is not None:
-            compare_lengths(info, rules.stored_frame_rate, info.frames, info.seconds)
-        for path in (clip.motion, clip.sound):
-            if path is not None and not rules.quick and path.is_file() and path.stat().st_size:
-                info.hashes[relative(path, rules.root)] = sha256(path)
-    except Exception as error:  # one strange clip must not end the check of all others
-        message = f"could not be checked ({type(error).__name__}: {error}); get its files again"
-        info.findings.error("clip_unreadable", clip.name, message)
+def examine(rules: Rules, clip: tuple[str, str]) -> ClipInfo:
+    """Read a clip (name, subject) as training does; every exception becomes a finding."""
+    name, subject = clip
+    info, storage = ClipInfo(name), rules.storage
+    motion_path, sound_path = rules.root / f"vertices_npy/{name}.npy", rules.root / f"wav/{name}.wav"
+    if isinstance(storage, ClipFolder):
+        motion_path, sound_path = storage.path_of(name), storage.sound_path(name)
+    hashed = isinstance(storage, ClipFolder) and not rules.quick
+    with info.findings.guard("motion_unreadable", motion_path, rules.root):
+        motion = storage.open(name)
+        if not rules.quick:
+            _check_motion(info.findings, rules, motion, relative(motion_path, rules.root), subject)
+        info.frames = motion.frames
+        if hashed:
+            info.hashes[relative(motion_path, rules.root)] = sha256(motion_path)
+    with info.findings.guard("sound_unreadable", sound_path, rules.root):
+        info.seconds = _seconds_in_header(rules, name, sound_path) if rules.quick else None
+        if not info.seconds:
+            speech = read_speech(sound_path) if isinstance(storage, ClipFolder) else storage.whole_speech(name)
+            info.seconds = len(speech) / SAMPLE_RATE
+            if not speech.any():
+                message = "is silent throughout; get the recording again or remove the clip"
+                info.findings.error("sound_silent", relative(sound_path, rules.root), message)
+        if hashed:
+            info.hashes[relative(sound_path, rules.root)] = sha256(sound_path)
+    if info.frames is not None and info.seconds is not None:
+        compare_lengths(info, rules.stored_frame_rate, info.frames, info.seconds)
     return info
 
 
-# Motion.
+def _seconds_in_header(rules: Rules, name: str, path: Path) -> float | None:
+    if not isinstance(rules.storage, ClipFolder):
+        sound = rules.storage.record.clips[name].sound
+        return sound.samples / sound.rate
+    refuse_cut_short(path)
+    with suppress(FaceDiffError), open_sound(path) as file:
+        return float(file.frames / file.samplerate)
+    return None  # of other containers than libsndfile's all is read
 
 
-def _check_motion(info: ClipInfo, rules: Rules, path: Path, subject: str) -> None:
-    findings, where, expected = info.findings, relative(path, rules.root), rules.n_vertices
-    if not path.is_file():  # a pipe would be waited for
-        findings.error("motion_unreadable", where, "is no regular file; put the motion there")
-        return
-    try:
-        rig = rig_path(path)
-        array: npt.NDArray[Any] = open_array(path)
-        if rig is not None:
-            motion = open_motion(path, expected)
-            array = motion.read(range(1 if rules.quick else motion.frames))
-    except FaceDiffError as error:
-        findings.error("motion_unreadable", where, str(error).removeprefix(f"{path}: "))
-        return
-    info.n_vertices = vertices_of(array.shape)
-    if not np.issubdtype(array.dtype, np.floating):
-        message = f"holds {array.dtype}, expected floating-point vertices; write it again"
-        findings.error("motion_dtype", where, message)
-        return
-    if info.n_vertices != expected:
-        topology = "which is no number of vertices" if info.n_vertices is None else f"{info.n_vertices} vertices"
-        message = (
-            f"has shape {array.shape}, {topology}; expected (frames, {3 * expected}), {expected} vertices: it has "
-            f"another topology or is no motion"
-        )
-        findings.error("motion_shape", where, message)
-        return
-    if not len(array):
-        findings.error("motion_empty", where, "has no frame; get it again or remove the clip")
-        return
-    if array.dtype == np.float16:
+def _check_motion(findings: Findings, rules: Rules, motion: ClipMotion, where: str, subject: str) -> None:
+    """Read all frames of a clip, and compare them with the speakers' templates."""
+    if getattr(motion, "dtype", None) == np.float16:
         findings.warning("motion_dtype", where, "is in half precision, some three digits; get it in float32")
-    info.frames = len(array) if rig is None else motion.frames
-    if not rules.quick:
-        check_vertices(findings, array.reshape(len(array), expected, 3), where, subject, rules.templates)
-
-
-def check_vertices(findings: Findings, motion: Array, where: str, subject: str, templates: Mapping[str, Array]) -> None:
-    """Look at all frames (T, V, 3) of a clip, and compare them with the speakers' templates."""
-    if _check_frames(findings, motion, where) and subject in templates:
-        _compare_with_templates(findings, motion, where, subject, templates)
-
-
-def _check_frames(findings: Findings, motion: Array, where: str) -> bool:
-    """Read all frames (T, V, 3); returns whether any is finite."""
-    damaged, first_damaged, largest = 0, 0, 0.0
-    start: npt.NDArray[np.float32] | None = None
-    for first in range(0, len(motion), CHUNK):
-        with np.errstate(all="ignore"):  # what float32 cannot hold is infinite for the models too
-            chunk = np.asarray(motion[first : first + CHUNK], np.float32)
-        finite = np.isfinite(chunk).all((1, 2))
-        if not finite.all():
-            first_damaged = first_damaged if damaged else first + int(np.argmin(finite))
-            damaged += int((~finite).sum())
-            chunk = chunk[finite]
-        if len(chunk):
-            start = chunk[0].copy() if start is None else start
-            largest = max(largest, float(np.abs(chunk - start).max()))
-    if damaged:
-        message = (
-            f"{damaged} of {len(motion)} frames hold NaN or infinity, the first is frame {first_damaged} (counted from "
-            f"0); get the clip again or remove it"
-        )
-        findings.error("motion_not_finite", where, message)
-    if start is not None and len(motion) > 1 and largest <= STILL * _size(start):
+    template = np.asarray(rules.templates.get(subject, np.zeros((rules.n_vertices, 3))), np.float32)
+    start = motion.offsets(range(1), template)[0]
+    largest = 0.0
+    for first in range(0, motion.frames, BLOCK):
+        block = motion.offsets(range(first, min(first + BLOCK, motion.frames)), template)
+        largest = max(largest, float(np.abs(block - start).max()))
+    if motion.frames > 1 and largest <= STILL * _size(template + start):
         findings.error("motion_still", where, "never moves: all frames are equal; get the clip again or remove it")
-    return start is not None
-
-
-def _compare_with_templates(
-    findings: Findings, motion: Array, where: str, subject: str, templates: Mapping[str, Array]
-) -> None:
-    picks = np.unique(np.linspace(0, len(motion) - 1, SAMPLED).astype(int))
-    frames = np.array(motion[picks], np.float64)
-    frames = frames[np.isfinite(frames).all((1, 2))]
-    template = np.asarray(templates[subject], np.float64)
     size = _size(template)
-    if not len(frames) or not size:
+    if not size:
         return
-    share = float(np.median([_distance(frame, template) for frame in frames])) / size
-    mean = frames.mean(axis=0)
-    distances = {name: _distance(mean, np.asarray(face, np.float64)) for name, face in templates.items()}
+    picks = np.unique(np.linspace(0, motion.frames - 1, SAMPLED).astype(int)).tolist()
+    offsets = motion.offsets(picks, template).astype(np.float64)
+    share = float(np.median(_distances(offsets))) / size
+    mean = template + offsets.mean(axis=0)
+    distances = {name: float(_distances(mean - face)) for name, face in rules.templates.items()}
     nearest = min(distances, key=lambda name: distances[name])
     if share > NEAR and distances[nearest] < NEARER * distances[subject]:
         message = (
@@ -203,35 +149,9 @@ def _size(vertices: Array) -> float:
     return float(np.linalg.norm(np.ptp(np.asarray(vertices, np.float64), axis=0)))
 
 
-def _distance(frame: npt.NDArray[np.float64], template: npt.NDArray[np.float64]) -> float:
-    """Mean distance between corresponding vertices of two faces (V, 3)."""
-    return float(np.linalg.norm(frame - template, axis=1).mean())
-
-
-# Speech.
-
-
-def _check_sound(info: ClipInfo, rules: Rules, path: Path) -> None:
-    findings, where = info.findings, relative(path, rules.root)
-    with findings.guard("sound_unreadable", path, rules.root):
-        if (fault := cut_short(path)) is not None:
-            findings.error("sound_truncated", where, f"{CUT}: {fault}; copy it again")
-            return
-        seconds = 0.0
-        with suppress(FaceDiffError), open_sound(path) as file:  # of other containers than libsndfile's all is read
-            info.sample_rate, info.channels = int(file.samplerate), int(file.channels)
-            seconds = file.frames / file.samplerate
-        if not rules.quick or not seconds:
-            speech = read_speech(path)
-            seconds = len(speech) / SAMPLE_RATE
-            if not speech.any():
-                findings.error(
-                    "sound_silent", where, "is silent throughout; get the recording again or remove the clip"
-                )
-        info.seconds = seconds
-
-
-# Both together.
+def _distances(offsets: Array) -> Any:  # noqa: ANN401 - a number, or one for each frame
+    """Mean length of offsets (…, V, 3)."""
+    return np.linalg.norm(offsets, axis=-1).mean(axis=-1)
 
 
 def compare_lengths(info: ClipInfo, frame_rate: float, frames: int, seconds: float) -> None:

@@ -85,20 +85,20 @@ class CheckReport:
     # by name: source, count, hash, duplicates, circulating_count; None for one that cannot be used
     regions: dict[str, dict[str, Any] | None] = field(default_factory=dict)
     # there, ended (whether preparation has ended), facediff (version that wrote it), changed, missing
-    manifest: dict[str, Any] = field(default_factory=dict)
+    manifest: dict[str, Any] = field(default_factory=lambda: {"changed": [], "missing": []})
 
     @property
     def sound(self) -> bool:
         """Whether there is no error; warnings are allowed."""
         return not any(finding.severity == "error" for finding in self.findings)
 
-    def sort(self) -> None:
+    def sorted(self) -> CheckReport:
         """Put errors first, then warnings, then notes; within these, the order stays."""
         self.findings.sort(key=lambda finding: SEVERITIES.index(finding.severity))
+        return self
 
     def state(self) -> dict[str, Any]:
         """The report as plain data, ready for JSON; the fields are those above with ``format`` and ``sound``."""
-        self.sort()
         return {"format": FORMAT, "sound": self.sound, **asdict(self), "root": str(self.root)}
 
 
@@ -107,7 +107,7 @@ class CheckReport:
 
 def relative(path: Path, root: Path) -> str:
     """A path as findings show it: relative to the corpus folder if it lies there."""
-    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+    return path.relative_to(root).as_posix() if path != root and path.is_relative_to(root) else str(path)
 
 
 def few(names: Iterable[object]) -> str:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args, get_origin, get_type_hints
 
-from facediff.data.check.findings import Findings, few
-from facediff.data.manifest import load_manifest
-from facediff.data.storage import WEIGHTS_FOLDER, rig_path
-from facediff.errors import FaceDiffError, choices, damaged, lacking, number
+from facediff.data.check.findings import few
+from facediff.data.manifest import read_manifest
+from facediff.data.storage import MOTION_FOLDERS, WEIGHTS_FOLDER, rig_path
+from facediff.errors import FaceDiffError, choices, lacking, number
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.paths import name_of_file
 
@@ -27,41 +26,22 @@ if TYPE_CHECKING:
     from facediff.data.packed.reader import PackedCorpus
 
 MANIFEST = "manifest.json"
-STATE = "prepare.json"
-"""In the folder while preparation is running or was interrupted."""
-SPLITS = ("train", "val", "test_a", "test_b", "test_c")
-
 PROBED = 8  # files of motion whose header is read to find the topology
 
 
 @dataclass(frozen=True)
 class CorpusFolder:
-    """Files of clips by name, and files that a killed program left half-written."""
+    """Files of clips by name, and the vertex count of most of the first few readable files of motion."""
 
     root: Path
-    motions: dict[str, Path] = field(default_factory=dict)
-    sounds: dict[str, Path] = field(default_factory=dict)
-    leftovers: list[str] = field(default_factory=list)
-    packed: PackedCorpus | None = None  # what the clips lie in, if they are no files
+    motions: dict[str, Path]
+    sounds: dict[str, Path]
+    n_vertices: int | None
 
     @property
     def names(self) -> list[str]:
         """Names of all clips that have at least one file, sorted."""
         return sorted({*self.motions, *self.sounds})
-
-    def n_vertices(self) -> int | None:
-        """The vertex count of most of the first few readable files of motion; None if there is none."""
-        if self.packed is not None:
-            return self.packed.record.n_vertices
-        counts: Counter[int] = Counter()
-        for path in islice(filter(Path.is_file, self.motions.values()), PROBED):  # a pipe would be waited for
-            try:
-                vertices = vertices_of(open_array(rig_path(path) or path).shape)
-            except Exception:  # reported when the clips are checked
-                vertices = None
-            if vertices is not None:
-                counts[vertices] += 1
-        return counts.most_common(1)[0][0] if counts else None
 
 
 @dataclass(frozen=True)
@@ -85,88 +65,53 @@ class CorpusView:
     circulating: Circulating | None = None  # facts about the copies that circulate
 
 
-def identify(
-    folder: CorpusFolder, recorded: object, corpus: str | None, manifest: dict[str, Any], findings: Findings
-) -> CorpusView | None:
-    """The corpus that a folder holds; None, with a finding, if it holds none or is not recognised.
-
-    ``recorded`` is the corpus that ``manifest.json`` or ``prepare.json`` names, ``corpus`` the one that the user names.
-    """
-    root, n_vertices = folder.root, folder.n_vertices()
-    if corpus is None and isinstance(manifest.get("person"), str):
-        view: CorpusView | None = None
-        with findings.guard("manifest_unreadable", root / MANIFEST, root):
-            view = _view_of_person(manifest, n_vertices)
-        return view
-    module = recognise(folder, recorded, n_vertices) if corpus is None else by_name(corpus, n_vertices)
+def identify(folder: CorpusFolder, manifest: dict[str, Any], corpus: str | None) -> CorpusView:
+    """The corpus of a folder: by the name or import path of its data module, or found out if None."""
+    if corpus is None and manifest.get("person"):
+        return _view_of_person(manifest, folder.n_vertices)
+    recorded = manifest.get("corpus")
+    module = recognise(folder, recorded) if corpus is None else by_name(corpus, folder.n_vertices)
     if module is not None:
-        return _view_of_module(module, root)
+        return _view_of_module(module, folder.root)
     contents = "there is no wav/*.wav or vertices_npy/*.npy"
     if folder.names:
-        vertices = "unreadable motion" if n_vertices is None else f"{number(n_vertices)} vertices"
+        vertices = "unreadable motion" if folder.n_vertices is None else f"{number(folder.n_vertices)} vertices"
         contents = f"there are clips {few(folder.names)} with {vertices}"
-    message = (
-        f"not recognised: {contents}, and {MANIFEST} names no known corpus. Give the right folder, name the corpus "
-        f"with --corpus, or run `facediff data prepare` if this is a raw distribution"
+    raise FaceDiffError(
+        f"{folder.root}: not recognised: {contents}, and {MANIFEST} names no known corpus. Give the right folder, name "
+        f"the corpus with --corpus, or run `facediff data prepare` if this is a raw distribution"
     )
-    findings.error("unrecognised", str(root), message)
-    return None
 
 
 def view_of(root: Path, corpus: str | None) -> CorpusView:
-    """Recognise a corpus folder.
-
-    Args:
-        root: the folder.
-        corpus: name or import path of its data module; found out if None.
-    """
-    from facediff.data.corpus import MOTION_FOLDERS
-    from facediff.data.manifest import read_manifest
-
-    if (root / STATE).is_file() and not (root / MANIFEST).is_file():
+    """Recognise a corpus folder; see :func:`identify`."""
+    if (root / "prepare.json").is_file() and not (root / MANIFEST).is_file():
         raise FaceDiffError(f"{root}: its preparation was interrupted; run the same `facediff data prepare` again")
-    manifest, findings = read_manifest(root), Findings()
-    view = identify(list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, manifest, findings)
-    if view is None:
-        raise FaceDiffError(f"{root}: {findings[0].message}")
-    return view
+    return identify(list_folder(root), read_manifest(root), corpus)
 
 
 # The files of the folder.
 
 
-def list_folder(root: Path, motion_folders: tuple[str, ...]) -> CorpusFolder:
-    """List the files of clips in a corpus folder; ``motion_folders`` are in the order of preference."""
-    folder = CorpusFolder(root)
-    motions = [(name, ".npy", folder.motions) for name in (*motion_folders, WEIGHTS_FOLDER)]
-    for name, suffix, files in [*motions, ("wav", ".wav", folder.sounds)]:
-        if not (root / name).is_dir():
-            continue
-        with damaged(f"{root / name}: cannot be read", "check its permissions", OSError):
-            paths = sorted(root / name / file for file in os.listdir(root / name))
-        for path in paths:
-            if path.name.startswith("."):
-                if ".partial-" in path.name:
-                    folder.leftovers.append(f"{name}/{path.name}")
-            elif path.suffix == suffix:
-                files.setdefault(name_of_file(path), path)
-    return folder
+def list_folder(root: Path) -> CorpusFolder:
+    """List the files of clips in a corpus folder; pipes, which would be waited for, are none."""
+    found: list[dict[str, Path]] = []
+    for folders, suffix in (((*MOTION_FOLDERS, WEIGHTS_FOLDER), "npy"), (("wav",), "wav")):
+        paths = [path for folder in folders for path in sorted((root / folder).glob(f"[!.]*.{suffix}"))]
+        # Of several folders the first has the preference.
+        found.append({name_of_file(path): path for path in reversed(paths) if path.is_file()})
+    motions, sounds = found
+    counts: Counter[int] = Counter()
+    for name in sorted(motions)[:PROBED]:
+        with suppress(Exception):  # reported when the clips are checked
+            counts[vertices_of(open_array(rig_path(motions[name]) or motions[name]).shape) or 0] += 1
+    return CorpusFolder(root, motions, sounds, counts.most_common(1)[0][0] or None if counts else None)
 
 
 def list_packed(packed: PackedCorpus) -> CorpusFolder:
     """The clips of a packed corpus, named as the files that they would be."""
     motions = {name: Path(f"vertices_npy/{name}.npy") for name in packed.names()}
-    sounds = {name: Path(f"wav/{name}.wav") for name in packed.names()}
-    return CorpusFolder(packed.folder, motions, sounds, packed=packed)
-
-
-def manifest_in(root: Path, name: str, findings: Findings) -> dict[str, Any]:
-    """``manifest.json`` or ``prepare.json``; empty if it is missing or cannot be read."""
-    path = root / name
-    if path.is_file():
-        with findings.guard("manifest_unreadable", path, root):
-            return load_manifest(path)
-    return {}
+    return CorpusFolder(packed.folder, motions, motions, packed.record.n_vertices)
 
 
 # The data module that reads it.
@@ -189,14 +134,13 @@ def by_name(name: str, n_vertices: int | None, option: str = "--corpus") -> Modu
     return next((module for module in fitting if module.n_vertices == n_vertices), fitting[0])
 
 
-def recognise(folder: CorpusFolder, recorded: object, n_vertices: int | None) -> Module | None:
+def recognise(folder: CorpusFolder, recorded: str | None) -> Module | None:
     """The data module that ``manifest.json`` names, else the one of these vertices that names most clips."""
     modules = _known()
-    if isinstance(recorded, str):
-        fitting = [m for m in modules if m.corpus_name in (recorded, recorded.removeprefix("facediff-"))]
-        if fitting:
-            return next((module for module in fitting if module.n_vertices == n_vertices), fitting[0])
-    fitting = [module for module in modules if module.n_vertices == n_vertices]
+    fitting = [m for m in modules if recorded and m.corpus_name in (recorded, recorded.removeprefix("facediff-"))]
+    if fitting:
+        return next((module for module in fitting if module.n_vertices == folder.n_vertices), fitting[0])
+    fitting = [module for module in modules if module.n_vertices == folder.n_vertices]
     counts = {module: sum(module.parse_name(name) is not None for name in folder.names) for module in fitting}
     return max(fitting, key=lambda module: counts[module]) if any(counts.values()) else None
 
@@ -263,23 +207,13 @@ def instance(module: Module, root: Path, way: str | None) -> SpeechMotionDataMod
     return module(root=str(root), **options)
 
 
-def is_rate(value: object) -> TypeGuard[float]:
-    """Whether a value of a manifest can be a frame rate."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 1 <= value <= 10_000
-
-
 def _view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> CorpusView:
     """A person's folder, as ``facediff data import-person`` writes it, through its own ``manifest.json``."""
     from facediff.data.corpus import parse_name
 
-    person, rate, vertices = manifest["person"], manifest.get("frame_rate"), manifest.get("n_vertices", n_vertices)
-    if not (is_rate(rate) and isinstance(vertices, int) and vertices > 0):
-        raise FaceDiffError(f"lacks the frame rate or the vertices of {person}; import the person again")
-
-    def split(clip: Clip) -> str | None:
-        recorded = clip.attributes.get("split")
-        return "test_a" if recorded == "test" else recorded
-
+    rate, vertices = manifest.get("frame_rate"), manifest.get("n_vertices", n_vertices)
+    if not rate or not vertices:
+        raise FaceDiffError(f"lacks the frame rate or the vertices of {manifest['person']}; import the person again")
     return CorpusView(
         corpus="person",
         data_module=None,
@@ -287,6 +221,8 @@ def _view_of_person(manifest: dict[str, Any], n_vertices: int | None) -> CorpusV
         frame_rate=rate,
         stored_frame_rate=rate,
         parse=parse_name,
-        split_of={None: split},
-        identities=[person],
+        split_of={
+            None: lambda clip: {"test": "test_a"}.get(clip.attributes.get("split", ""), clip.attributes.get("split"))
+        },
+        identities=[manifest["person"]],
     )

@@ -1,9 +1,9 @@
-"""Checking the files that all clips share: manifest, templates, mesh and regions."""
+"""Checking the files that all clips share: those of the manifest, templates, mesh and regions."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from facediff.data.check.clip import Array
 from facediff.data.check.findings import Findings, few, relative
-from facediff.data.check.layouts import MANIFEST, STATE, CorpusView
-from facediff.errors import counted, number
+from facediff.data.check.layouts import MANIFEST, CorpusView
+from facediff.errors import counted
 from facediff.mesh.mesh import surface_area
 from facediff.utils.checksums import sha256
 from facediff.utils.paths import compose
@@ -24,39 +24,23 @@ if TYPE_CHECKING:
 AREA_TOLERANCE = 1e-3  # float32 templates are within 1e-6
 
 
-# The records of ``facediff data prepare``, and whether the files still agree with them.
-
-
-def check_ended(root: Path, corpus: str | None, findings: Findings) -> bool:
-    """Whether preparation has ended, where it was begun at all."""
-    if not (root / STATE).exists():
-        return True
-    message = (
-        f"preparation of this folder has not ended: run the same `facediff data prepare {corpus or 'CORPUS'} RAW "
-        f"{root}` again (it continues where it stopped), or wait if it is running"
-    )
-    findings.error("unfinished", STATE, message)
-    return False
-
-
 def check_files(
-    root: Path, manifest: Mapping[str, Any], hashes: Mapping[str, str], findings: Findings, *, quick: bool
+    root: Path, files: Mapping[str, Any], hashes: Mapping[str, str], findings: Findings, *, quick: bool
 ) -> dict[str, list[str]]:
     """Compare the files with their sizes (``quick``), or their SHA-256, in ``manifest.json``.
 
     ``hashes`` holds the SHA-256 of files that were read already. Returns the names of the files that are not as
     recorded: ``changed`` and ``missing``.
     """
-    files = manifest.get("files")
     differing: dict[str, list[str]] = {"changed": [], "missing": []}
-    for name, recorded in files.items() if isinstance(files, dict) else ():
+    for name, recorded in files.items():
         path = root / name
-        if not isinstance(recorded, dict) or not _is_below(root, path):
-            message = f'"{name}" is no entry of a file below the folder; prepare the folder again'
-            findings.error("manifest_entry", MANIFEST, message)
-            continue
         with findings.guard("file_unreadable", path, root):
-            if not path.is_file():
+            # An untrusted manifest must not have other files opened.
+            if not isinstance(recorded, dict) or not path.resolve().is_relative_to(root.resolve()):
+                message = f'"{name}" is no entry of a file below the folder; prepare the folder again'
+                findings.error("manifest_entry", MANIFEST, message)
+            elif not path.is_file():
                 differing["missing"].append(name)
                 message = "is in manifest.json but not there; prepare the folder again"
                 findings.error("file_missing", name, message)
@@ -67,26 +51,6 @@ def check_files(
                 message = "is not what was written (manifest.json): changed since, or damaged; prepare the folder again"
                 findings.error("file_changed", name, message)
     return differing
-
-
-def _is_below(root: Path, path: Path) -> bool:
-    """Whether a name from the manifest stays in the folder: an untrusted manifest must not have other files opened."""
-    try:
-        return path.resolve().is_relative_to(root.resolve())
-    except (OSError, ValueError, RuntimeError):
-        return False
-
-
-def check_account(manifest: Mapping[str, Any], findings: Findings) -> None:
-    """Repeat the report of the preparation: clips that failed, and gaps in the raw folder."""
-    failed, gaps = manifest.get("failed"), manifest.get("missing")
-    if isinstance(failed, dict) and failed:
-        name, reason = next(iter(failed.items()))
-        message = f"{counted(len(failed), 'clip')} could not be prepared, the first: {name}: {reason}"
-        findings.warning("prepare_failed", MANIFEST, message)
-    if isinstance(gaps, dict) and gaps:
-        message = f"the raw folder was not complete: {few(gaps)}; the reasons are in {MANIFEST}"
-        findings.note("prepare_missing", MANIFEST, message)
 
 
 # Templates, the neutral faces.
@@ -155,10 +119,9 @@ def check_areas(
 # Mesh and regions.
 
 
-def check_mesh(root: Path, view: CorpusView, findings: Findings) -> tuple[npt.NDArray[np.int32] | None, str | None]:
+def check_mesh(opened: Corpus, view: CorpusView, findings: Findings) -> tuple[npt.NDArray[np.int32] | None, str | None]:
     """Check the mesh file; returns its faces (F, 3) if they can be used, and its path relative to the folder."""
-    from facediff.mesh import read_mesh
-
+    root = opened.root
     paths = [folder / file for file in view.mesh_files for folder in (root, root / "templates")]
     path = next(filter(Path.is_file, paths), None)
     if path is None:
@@ -169,53 +132,32 @@ def check_mesh(root: Path, view: CorpusView, findings: Findings) -> tuple[npt.ND
         return None, None
     faces: npt.NDArray[np.int32] | None = None
     with findings.guard("mesh_broken", path, root):
-        mesh = read_mesh(path)
-        if len(mesh.vertices) == view.n_vertices and 0 <= mesh.faces.min() <= mesh.faces.max() < view.n_vertices:
-            faces = mesh.faces
-        else:
-            message = (
-                f"has {number(len(mesh.vertices))} vertices, or faces of others; expected {number(view.n_vertices)}"
-            )
-            findings.error("mesh_broken", relative(path, root), f"{message}; put the mesh of the corpus there")
+        mesh = opened.read_mesh(view.mesh_files)
+        faces = None if mesh is None else mesh.faces
     return faces, relative(path, root)
 
 
 def check_regions(root: Path, view: CorpusView, findings: Findings) -> dict[str, dict[str, Any] | None]:
     """Check which vertices the regions are, region by region; None for one that cannot be used."""
-    return {name: _check_region(root, view, name, sources, findings) for name, sources in view.region_sources.items()}
-
-
-def _check_region(
-    root: Path, view: CorpusView, name: str, sources: Sequence[str], findings: Findings
-) -> dict[str, Any] | None:
     from facediff.data.corpus import find_region
-    from facediff.metrics.regions import TOPOLOGIES, Part
+    from facediff.metrics.regions import TOPOLOGIES
 
-    # The first source with a file is used, as in training.
-    source = next((source for source in sources if (root / source.partition(":")[0]).is_file()), None)
-    path = root / (sources[0] if source is None else source).partition(":")[0]
-    section: dict[str, Any] | None = None
-    with findings.guard("region_missing" if source is None else "region_broken", path, root):
-        region = find_region(root, sources, name, view.n_vertices, view.region_help)
-        if region.duplicates:
-            message = f"{counted(region.duplicates, 'index', 'indices')} of {name} repeated; counted once"
-            findings.note("region_repeats", str(source), message)
-        topology = TOPOLOGIES.get(view.corpus)
-        part: Part = "lips" if name == "lips" else "upper"
-        counts = {} if topology is None else topology.lips if part == "lips" else topology.upper
-        published = region.count if region.count in counts else next(iter(counts), None)
-        if topology is not None and published != region.count:
-            message = f"{topology.remark(part, region)}: scores over it differ from published ones"
-            findings.note("region_unusual", str(source), message)
-        section = {"source": source, "count": region.count, "hash": region.hash}
-        section |= {"duplicates": region.duplicates, "circulating_count": published}
-    return section
-
-
-def check_pairs(opened: Corpus, findings: Findings) -> None:
-    """Check the pairs of vertices on the inner lips and the eyelids, where a corpus has them."""
-    from facediff.data.corpus import EYELID_PAIRS, LIP_PAIRS
-
-    for file in (LIP_PAIRS, EYELID_PAIRS):
-        with findings.guard("region_broken", opened.root / file, opened.root):
-            opened.read_pairs(file)
+    sections: dict[str, dict[str, Any] | None] = dict.fromkeys(view.region_sources)
+    topology = TOPOLOGIES.get(view.corpus)
+    for name, sources in view.region_sources.items():
+        # The first source with a file is used, as in training.
+        source = next((source for source in sources if (root / source.partition(":")[0]).is_file()), None)
+        path = root / (source or sources[0]).partition(":")[0]
+        with findings.guard("region_missing" if source is None else "region_broken", path, root):
+            region = find_region(root, sources, name, view.n_vertices, view.region_help)
+            if region.duplicates:
+                message = f"{counted(region.duplicates, 'index', 'indices')} of {name} repeated; counted once"
+                findings.note("region_repeats", str(source), message)
+            counts = {} if topology is None else topology.lips if name == "lips" else topology.upper
+            published = region.count if region.count in counts else next(iter(counts), None)
+            if topology is not None and published != region.count:
+                remark = topology.remark("lips" if name == "lips" else "upper", region)
+                findings.note("region_unusual", str(source), f"{remark}: scores over it differ from published ones")
+            facts = {"source": source, "count": region.count, "hash": region.hash, "duplicates": region.duplicates}
+            sections[name] = facts | {"circulating_count": published}
+    return sections

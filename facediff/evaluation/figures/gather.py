@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.check.layouts import by_name, instance, list_folder, recognise
-from facediff.data.corpus import MOTION_FOLDERS, read_manifest, read_templates
+from facediff.data.corpus import read_manifest, read_templates
 from facediff.data.puppet import cache_root, made_root
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.material import FigureData, find_clips
@@ -105,16 +105,16 @@ def phonemes_of(material: FigureData, clip: str, file: Path | None = None) -> li
 
 def _recognise(name: str | None, root: Path, manifest: dict[str, Any]) -> SpeechMotionDataModule | None:
     """The data module of this topology; None if it is not recognised. The folder decides between several."""
-    folder = list_folder(root, MOTION_FOLDERS)
+    folder = list_folder(root)
     if name is not None:
         if "." in name:
             sys.path.append(os.getcwd())  # a data module of the user's own may be in the working folder
-        return instance(by_name(name, folder.n_vertices()), root, None)
+        return instance(by_name(name, folder.n_vertices), root, None)
     if not folder.motions or isinstance(manifest.get("person"), str):
         return None
-    kind = recognise(folder, manifest.get("corpus"), folder.n_vertices())
+    kind = recognise(folder, manifest.get("corpus"))
     module = None if kind is None else instance(kind, root, None)
-    return module if module is not None and module.n_vertices == folder.n_vertices() else None
+    return module if module is not None and module.n_vertices == folder.n_vertices else None
 
 
 def _find_mesh(path: Path | None, root: Path, module: SpeechMotionDataModule | None, n_vertices: int) -> Mesh | None:

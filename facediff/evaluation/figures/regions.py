@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.check.findings import Findings
-from facediff.data.check.layouts import MANIFEST, CorpusView, identify, list_folder, manifest_in
-from facediff.data.corpus import MOTION_FOLDERS, Corpus, find_region
+from facediff.data.check.layouts import view_of
+from facediff.data.corpus import Corpus, find_region
 from facediff.errors import FaceDiffError
 from facediff.mesh.mesh import Mesh
 from facediff.metrics import Region
@@ -48,7 +47,7 @@ def draw_regions(
     Returns:
         a line for each region: name, vertex count, hash, source.
     """
-    view = find_view(root, corpus)
+    view = view_of(root, corpus)
     mesh = Corpus(root, view.n_vertices, view.frame_rate, stored_frame_rate=view.frame_rate).read_mesh(view.mesh_files)
     if mesh is None:
         names = " or ".join(view.mesh_files)
@@ -61,16 +60,6 @@ def draw_regions(
         lines[part] = legend(root, sources, regions[part])
     save_image(output, draw(mesh, regions, lines, f"{view.corpus}, {view.n_vertices} vertices", size))
     return list(lines.values())
-
-
-def find_view(root: Path, corpus: str | None) -> CorpusView:
-    """The corpus of a folder, as ``facediff data check`` recognises it."""
-    findings = Findings()
-    manifest = manifest_in(root, MANIFEST, findings)
-    view = identify(list_folder(root, MOTION_FOLDERS), manifest.get("corpus"), corpus, manifest, findings)
-    if view is None:
-        raise FaceDiffError(f"{root}: {findings[-1].message}")
-    return view
 
 
 def legend(root: Path, sources: Sequence[str], region: Region) -> str:

@@ -73,11 +73,8 @@ def test_a_preparation_that_has_not_ended(copies: Path) -> None:
     (root / "prepare.json").write_text(json.dumps({"corpus": "biwi", "options": {}}))
     report = check(root, quick=True)
     assert kinds(report) == ["unfinished"]
-    assert "run the same `facediff data prepare biwi RAW" in message(report, "unfinished")
+    assert "run the same `facediff data prepare` again" in message(report, "unfinished")
     assert report.manifest["ended"] is False
-    for name in ("vertices_npy", "wav"):
-        shutil.rmtree(root / name)
-    assert check(root).corpus == "biwi"  # before the first clip was written
 
 
 @pytest.mark.parametrize("files", [[], ["wav/hello.wav", "vertices_npy/hello.npy"], ["a/b.txt"]])
@@ -110,7 +107,7 @@ def test_a_persons_folder(copies: Path) -> None:
         "test_a": 24 + 26,
     }
     (root / "manifest.json").write_text(json.dumps({**manifest, "frame_rate": None}))
-    assert kinds(check(root)) == ["manifest_unreadable"]
+    assert kinds(check(root)) == ["unrecognised"]
 
 
 def test_files_are_compared_with_the_manifest(copies: Path) -> None:
