@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -51,19 +50,6 @@ WEIGHTS = {"velocity": 5.0, "head": 1.0, "commitment": 0.2}
 
 LARGEST_SCALE = math.log(100)
 """Of the logarithm that attention's queries are multiplied by."""
-
-
-@dataclass(frozen=True)
-class ChunkState:
-    """State of the generator from a chunk to the next.
-
-    Attributes:
-        bits: of its motion, encoded again by itself.
-        memory: tokens that the generator attends to, without their positions.
-    """
-
-    bits: Bits
-    memory: Float[Tensor, "1 tokens dim"]
 
 
 @registry.model.register("ARTalk")
@@ -212,14 +198,11 @@ class ARTalk(ParametricModel):
         if self.stage != "codec":
             with torch.no_grad():
                 flipped = self.codec.quantise(codes[:, size:], FLIPPED_BITS)[1] if self.training else bits
-                memory_bits = bits_past.clone()
             style = self.drop(self.style_token(batch), self.generator.no_style)
             audio = torch.stack([self.encode_chunk(wave) for wave in self.chunk_waves(batch, first)])
             audio = self.drop(audio, torch.zeros((), device=self.device))
-            memory = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(memory_bits))], 1)
-            memory = self.drop(memory, self.generator.no_style)
-            tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(flipped))], 1)
-            logits = self.generator(tokens, memory, audio)
+            memory = self.drop(self.tokens_of(bits_past, style), self.generator.no_style)
+            logits = self.generator(self.tokens_of(flipped, style), memory, audio)
             token_mask = self.counted_tokens(valid)
             entropy = F.cross_entropy(logits.permute(0, 3, 1, 2), bits, reduction="none").mean(2)
             terms["bits"] = (entropy * token_mask).sum() / token_mask.sum().clamp_min(1)
@@ -294,39 +277,36 @@ class ARTalk(ParametricModel):
         count = max(1, math.ceil(self.frames_of(len(audio)) / self.scales[-1]))
         size = self.chunk_samples
         filled = F.pad(audio, (0, max(0, count * size - len(audio))))
-        state, parts, logits = self.begin(style), [], []
+        bits, parts, logits = self.bits_at_rest(style), [], []
         for number in progress(range(count)) if progress is not None else range(count):
-            motion, chunk_logits, state = self.next_chunk(filled[number * size : (number + 1) * size], style, state)
+            motion, chunk_logits, bits = self.next_chunk(filled[number * size : (number + 1) * size], style, bits)
             parts.append(motion)
             logits.append(chunk_logits)
         return torch.cat(parts)[: self.frames_of(len(audio))], torch.stack(logits)
 
-    def begin(self, style: Float[Tensor, "1 1 dim"]) -> ChunkState:
-        """The state before the first chunk: of zero motion."""
-        rest = style.new_zeros(1, self.scales[-1], len(self.modelled))
-        bits = self.codec.bits_of(rest)
-        return ChunkState(bits, self.memory_of(bits, style))
+    def bits_at_rest(self, style: Float[Tensor, "1 1 dim"]) -> Bits:
+        """Bits of zero motion, which stand before the first chunk."""
+        return self.codec.bits_of(style.new_zeros(1, self.scales[-1], len(self.modelled)))
 
-    def memory_of(self, bits: Bits, style: Float[Tensor, "1 1 dim"]) -> Float[Tensor, "1 tokens dim"]:
-        """A chunk's tokens as the next chunk attends to them."""
+    def tokens_of(self, bits: Bits, style: Float[Tensor, "batch 1 dim"]) -> Float[Tensor, "batch tokens dim"]:
+        """A chunk's tokens as far as there are bits: the style, then the coarser rates' decoded codes."""
         return torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(bits))], 1)
 
     def next_chunk(
-        self, wave: Float[Tensor, " samples"], style: Float[Tensor, "1 1 dim"], state: ChunkState
-    ) -> tuple[Float[Tensor, "frames channels"], Float[Tensor, "tokens bits 2"], ChunkState]:
-        """Motion of a chunk, the generator's logits of its bits, and the state for the next chunk."""
-        audio, tokens = self.encode_chunk(wave)[None], style
+        self, wave: Float[Tensor, " samples"], style: Float[Tensor, "1 1 dim"], past: Bits
+    ) -> tuple[Float[Tensor, "frames channels"], Float[Tensor, "tokens bits 2"], Bits]:
+        """Motion of a chunk, the generator's logits of its bits, and the bits of that motion, for the next chunk."""
+        audio, tokens, memory = self.encode_chunk(wave)[None], style, self.tokens_of(past, style)
         count = 0
         for number, scale in enumerate(self.scales):
             count += scale
-            logits = self.generator(tokens, state.memory, audio[:, :count])
+            logits = self.generator(tokens, memory, audio[:, :count])
             # All bits are taken anew from every pass, coarser rates' too, as the authors do.
             bits = logits.argmax(3)
             if number + 1 < len(self.scales):
-                tokens = torch.cat([style, self.generator.code_in(self.codec.inputs_of_next(bits))], 1)
-        _, motion = self.codec.decode(state.bits, bits)
-        again = self.codec.bits_of(motion)
-        return motion[0], logits[0], ChunkState(again, self.memory_of(again, style))
+                tokens = self.tokens_of(bits, style)
+        _, motion = self.codec.decode(past, bits)
+        return motion[0], logits[0], self.codec.bits_of(motion)
 
     @property
     def stream_timing(self) -> tuple[float, float]:
@@ -377,7 +357,7 @@ class ChunkStream(SpeechStream):
         super().__init__(model, clip, seeds=seeds, plan=plan)
         with torch.inference_mode():
             self._token = model.style_token(self.clip)
-            self._state = model.begin(self._token)
+            self._bits = model.bits_at_rest(self._token)
         self._wave = self._token.new_zeros(0)  # speech that is not animated yet, shorter than a chunk
         self._raw = self._token.new_zeros(0, model.coordinates)  # not smoothed yet
         self._first = 0  # the frame that it begins with
@@ -410,7 +390,7 @@ class ChunkStream(SpeechStream):
 
     def _next(self, wave: Tensor, frames: int) -> None:
         """Animate a chunk, of which so many frames are wanted."""
-        motion, _, self._state = self.model.next_chunk(wave, self._token, self._state)
+        motion, _, self._bits = self.model.next_chunk(wave, self._token, self._bits)
         self._raw = torch.cat([self._raw, self.model.placed(motion[:frames])])
 
     @property

@@ -246,35 +246,18 @@ class PeriodicDecoder(nn.Module):
         self.layers = nn.ModuleList(DecoderLayer(dim, num_heads, hidden_dim, dropout) for _ in range(num_layers))
         self.dropout = nn.Dropout(dropout)
 
-    @property
-    def device(self) -> torch.device:
-        """Where it computes."""
-        return next(self.parameters()).device
-
-    def positions(self, frames: int, start: int = 0) -> Float[Tensor, "frames dim"]:
-        """Sinusoids of the frame number within its period; even channels are sines, odd ones cosines."""
-        return periodic_positions(frames, self.dim, self.period, start=start, device=self.device)
-
-    def bias(self, frames: int, start: int = 0) -> Float[Tensor, "heads frames positions"]:
-        """Bias of the scores of frames ``start`` to ``start + frames``: less the older a frame, −∞ for later ones."""
-        return periodic_bias(frames, self.num_heads, self.period, start=start, device=self.device)
-
     def forward(
         self, tokens: Float[Tensor, "batch frames dim"], memory: Float[Tensor, "batch steps dim"]
     ) -> Float[Tensor, "batch frames dim"]:
         """All frames together; positions are added to the tokens here."""
-        frames = tokens.shape[1]
-        x, bias = self.dropout(tokens + self.positions(frames)), self.bias(frames)
+        frames, device = tokens.shape[1], tokens.device
+        x = self.dropout(tokens + periodic_positions(frames, self.dim, self.period, device=device))
+        bias = periodic_bias(frames, self.num_heads, self.period, device=device)
         for layer in self.layers:
             # A prefix of the frames goes with a prefix of the speech.
             speech = layer.cross_attention.keys_values(memory[:, : frames * self.steps])  # type: ignore[union-attr, operator]
             x = layer(x, speech, layer.self_attention.keys_values(x), bias)  # type: ignore[union-attr, operator]
         return x
-
-    def start(self, memory: Float[Tensor, "batch steps dim"]) -> Continuation:
-        """The state before the first frame, for ``step``."""
-        speech = [layer.cross_attention.keys_values(memory) for layer in self.layers]  # type: ignore[union-attr, operator]
-        return Continuation(self, speech, memory.shape[1] // self.steps)
 
 
 class Continuation:
@@ -282,49 +265,31 @@ class Continuation:
 
     Args:
         decoder: the decoder.
-        speech: keys and values of all speech, for each layer.
-        frames: how many will be made.
+        memory: all speech, (batch, steps, dim).
     """
 
-    def __init__(self, decoder: PeriodicDecoder, speech: list[AttentionContext], frames: int) -> None:
-        self.decoder, self.speech, self.frame = decoder, speech, 0
-        self._keys: list[list[Tensor]] = [[] for _ in decoder.layers]
-        self._values: list[list[Tensor]] = [[] for _ in decoder.layers]
-        self._positions, self._room = decoder.positions(frames), frames
-        self._kept: list[AttentionContext] | None = None
+    def __init__(self, decoder: PeriodicDecoder, memory: Float[Tensor, "batch steps dim"]) -> None:
+        self.decoder, self.frame, self.frames = decoder, 0, memory.shape[1] // decoder.steps
+        self._speech = [layer.cross_attention.keys_values(memory) for layer in decoder.layers]  # type: ignore[union-attr, operator]
+        self._past: list[AttentionContext | None] = [None for _ in decoder.layers]
+        self._positions = periodic_positions(self.frames, decoder.dim, decoder.period, device=memory.device)
 
     def step(self, token: Float[Tensor, "batch 1 dim"]) -> Float[Tensor, "batch 1 dim"]:
         """The next frame; its position is added to the token here."""
         decoder, at, steps = self.decoder, self.frame, self.decoder.steps
         # Masks are causal and a frame's row of the bias depends on its own number only, so that what earlier frames
         # computed stays exact; one frame then costs one token and not all tokens so far.
-        x, bias = decoder.dropout(token + self._positions[at]), decoder.bias(1, at)
+        x = decoder.dropout(token + self._positions[at])
+        bias = periodic_bias(1, decoder.num_heads, decoder.period, start=at, device=token.device)
         for number, layer in enumerate(decoder.layers):
-            past = self._with(number, layer.self_attention.keys_values(x))  # type: ignore[union-attr, operator]
-            speech = AttentionContext(*(part[:, :, at * steps : (at + 1) * steps] for part in self.speech[number]))
-            x = layer(x, speech, past, bias)
+            past, new = self._past[number], layer.self_attention.keys_values(x)  # type: ignore[union-attr, operator]
+            if past is not None:
+                new = AttentionContext(*(torch.cat(parts, 2) for parts in zip(past, new, strict=True)))
+            self._past[number] = new
+            speech = AttentionContext(*(part[:, :, at * steps : (at + 1) * steps] for part in self._speech[number]))
+            x = layer(x, speech, new, bias)
         self.frame += 1
         return x
-
-    def _with(self, number: int, new: AttentionContext) -> AttentionContext:
-        """Keys and values of a layer up to the present frame."""
-        if torch.is_grad_enabled():  # what a gradient goes through must not be written over
-            keys, values = self._keys[number], self._values[number]
-            keys.append(new.key)
-            values.append(new.value)
-            return AttentionContext(torch.cat(keys, 2), torch.cat(values, 2))
-        # Room for all frames is taken once. Concatenating in every frame would copy all earlier keys and values again,
-        # which for T frames is work of the order T².
-        if self._kept is None:
-            batch, heads, _, width = new.key.shape
-            self._kept = [
-                AttentionContext(*(new.key.new_empty(batch, heads, self._room, width) for _ in range(2)))
-                for _ in self.decoder.layers
-            ]
-        cache = self._kept[number]
-        for store, part in zip(cache, new, strict=True):
-            store[:, :, self.frame : self.frame + 1] = part
-        return AttentionContext(*(store[:, :, : self.frame + 1] for store in cache))
 
 
 class SpeechDecoder(nn.Module):
@@ -403,8 +368,8 @@ class AutoregressiveNetwork(SpeechDecoder):
             # every frame to the result of the one before.
             turn = first.weight @ last.weight
             shift = first.weight @ last.bias + first.bias
-        state, token, features = self.decoder.start(memory), style[:, None], []
-        for _ in range(memory.shape[1] // self.decoder.steps):
+        state, token, features = Continuation(self.decoder, memory), style[:, None], []
+        for _ in range(state.frames):
             features.append(state.step(token))
             token = F.linear(features[-1], turn, shift) + style[:, None]
         return self.motion_out(torch.cat(features, 1))

@@ -317,7 +317,15 @@ class DirectModel(PublishedModel):
 
     def graphs(self) -> Graphs:
         """Speech to features, features to motion."""
-        return direct_graphs(self)
+
+        def encode(speech: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
+            return self.encode_speech(speech, frames)
+
+        speech = speech_graph(self, encode, lambda frames: self.speech_steps * frames)
+        features = results_of(speech)
+        inputs: dict[str, Any] = {"features": features, "identity": torch.zeros(len(features), dtype=torch.long)}
+        motion = Graph("motion", DirectMotion(self), inputs, {"features": FRAMES, "identity": BATCH}, ("offsets",))
+        return whole_model(self, [speech, motion])
 
 
 # The methods as graphs, without PyTorch; see facediff.models.graphs.
@@ -349,24 +357,6 @@ class DirectMotion(ModelPart[DirectModel]):
         model = self.model
         motion = model.decode(features, model.weights_of(identity), None)
         return model.offsets_of(motion)
-
-
-def direct_graphs(model: DirectModel) -> Graphs:
-    """The graphs of a method that generates all frames in one pass."""
-
-    def encode(speech: Speech, frames: Int[Tensor, " batch"], _: int) -> Tensor:
-        return model.encode_speech(speech, frames)
-
-    speech = speech_graph(model, encode, lambda frames: model.speech_steps * frames)
-    features = results_of(speech)
-    inputs: dict[str, Any] = {"features": features, "identity": zeros(len(features))}
-    motion = Graph("motion", DirectMotion(model), inputs, {"features": FRAMES, "identity": BATCH}, ("offsets",))
-    return whole_model(model, [speech, motion])
-
-
-def zeros(batch: int) -> Int[Tensor, " batch"]:
-    """Indices."""
-    return torch.zeros(batch, dtype=torch.long)
 
 
 # Parts of their networks and losses.

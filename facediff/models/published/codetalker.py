@@ -27,7 +27,7 @@ from facediff.models.base import AnimationModel
 from facediff.models.checkpoint_content import IMPORTED
 from facediff.models.inference import BatchMotion, Motion, Progress, Style
 from facediff.models.layers import Frames, Heads, Layers, Width, frame_mask
-from facediff.models.published.autoregressive import AutoregressiveModel, SpeechDecoder
+from facediff.models.published.autoregressive import AutoregressiveModel, Continuation, SpeechDecoder
 from facediff.models.published.base import TRAINED_NETWORK, SpeakerTable, masked_mean
 from facediff.models.published.motion_prior import MotionPrior, perplexity
 from facediff.models.squared_errors import mean_squared_error
@@ -322,7 +322,7 @@ class CodeTalker(AutoregressiveModel):
         """Frame by frame; nothing is random."""
         self.check_length(frames, batch.names)
         style, memory = self.conditions(batch, frames)
-        state, token = self.network.decoder.start(memory), style[:, None]
+        state, token = Continuation(self.network.decoder, memory), style[:, None]
         values: list[Tensor] = []
         # The predictor's keys, values and codes of earlier frames stay as they are. The prior attends to all frames and
         # normalises over them, so its output for earlier ones changes with every frame: it decodes all codes again, but

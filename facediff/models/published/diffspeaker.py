@@ -281,14 +281,15 @@ class SpeakerSampler(Sampler):
         return (math.sqrt(signal_after) - of_noisy * math.sqrt(signal_now)) * predictions[-1] + of_noisy * noisy
 
 
-def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"]) -> BatchMotion:
-    """The mean of each frame and its two neighbours; a clip's first and last frame stay as they are."""
-    if motion.shape[1] < 3:
-        return motion
-    # Published for VOCASET alone, and of the result only: training and the sampler do not see it.
-    mean = (motion[:, :-2] + motion[:, 1:-1] + motion[:, 2:]) / 3
-    inner = frame_mask(frames - 2, motion.shape[1] - 2)[..., None, None]
-    return torch.cat([motion[:, :1], torch.where(inner, mean, motion[:, 1:-1]), motion[:, -1:]], 1)
+def smoothed(motion: BatchMotion, frames: Int[Tensor, " batch"] | None = None) -> BatchMotion:
+    """The mean of each frame and its two neighbours; a clip's first and last frame, and padding, stay as they are."""
+    # Published for VOCASET alone, and of the result only: training and the sampler do not see it. By indices and not by
+    # slices: a graph takes clips of any length, and slices of one or two frames would be empty.
+    longest = motion.shape[1]
+    indices = torch.arange(longest, device=motion.device)
+    before, after = motion[:, (indices - 1).clamp_min(0)], motion[:, (indices + 1).clamp_max(longest - 1)]
+    last = longest - 1 if frames is None else frames[:, None] - 1
+    return torch.where(((indices > 0) & (indices < last))[..., None, None], (before + motion + after) / 3, motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -459,13 +460,4 @@ class SpeakerMotion(ModelPart[DiffSpeaker]):
     ) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""
         motion = self.model.motion_of(sample, noise)
-        return smoothed_whole(motion) if self.model.smooth else motion
-
-
-def smoothed_whole(motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames points dims"]:
-    """As :func:`smoothed`, of clips without padding and of any length."""
-    # By indices and not by slices: a graph takes clips of any length, and slices of one or two frames would be empty.
-    indices, last = torch.arange(motion.shape[1]), motion.shape[1] - 1
-    before, after = motion[:, (indices - 1).clamp_min(0)], motion[:, (indices + 1).clamp_max(last)]
-    inner = ((indices > 0) & (indices < last))[:, None, None]
-    return torch.where(inner, (before + motion + after) / 3, motion)
+        return smoothed(motion) if self.model.smooth else motion

@@ -34,7 +34,7 @@ from facediff.models.graphs import (
     update_table,
 )
 from facediff.models.inference import BatchMotion, Progress
-from facediff.models.published.base import PublishedModel, whole_model, zeros
+from facediff.models.published.base import PublishedModel, whole_model
 from facediff.models.samplers import NoiseProcess, NoiseSource, Sampler
 
 
@@ -226,10 +226,10 @@ def diffusion_graphs(
     batch, frames, dim = features.shape
     examples = {
         "features": features,
-        "identity": zeros(batch),
+        "identity": torch.zeros(batch, dtype=torch.long),
         "template": torch.zeros(batch, model.n_vertices, model.dims),
         "state": torch.zeros(batch, frames, state),
-        "step": zeros(batch),
+        "step": torch.zeros(batch, dtype=torch.long),
     }
     inputs = {name: examples[name] for name in inspect.signature(step.forward).parameters}
     denoising = Graph("step", step, inputs, {name: AXES[name] for name in inputs}, ("prediction", "kept"))
