@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import OptionError
 from facediff.registry import UnknownComponentError, acting
@@ -19,12 +18,13 @@ from facediff.speech.prosody import ProsodicEvent, ProsodyTracker
 from facediff.speech.voice_activity import HOP, Wave
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hints import checks_arguments
+from facediff.utils.numerics import Array
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
 
-Acted = npt.NDArray[np.float64]
+Acted = Array
 """Values of the channels :data:`facediff.editing.controls.controlled_face.ACTED` in each frame, (T, 5)."""
 
 Strength = Annotated[float, Range(0, 2)]

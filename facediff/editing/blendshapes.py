@@ -25,9 +25,8 @@ from facediff.spaces.space import Space
 from facediff.spaces.visemes import VisemeSet, visemes
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
+from facediff.utils.numerics import Array, Floats, Indices, Integers
 from facediff.utils.plain_files import json_text, write_table
-
-Array = npt.NDArray[np.float64]
 
 CHUNK_BYTES = 32 * 2**20
 AROUND = 1 / 15  # Seconds before and after a shape's work in which it is free to fade
@@ -185,7 +184,7 @@ def has_arkit_weights(animation: Animation) -> bool:
     return has_weights or is_built_in_face(len(animation.template), animation.faces)
 
 
-def is_built_in_face(vertices: int, faces: npt.NDArray[np.integer] | None) -> bool:
+def is_built_in_face(vertices: int, faces: Integers | None) -> bool:
     """Whether a mesh of so many vertices with these triangles is one of the built-in faces."""
     from facediff.synthetic.known_faces import is_built_in
 
@@ -297,7 +296,7 @@ def encode(animation: Animation, rig: LinearRig) -> Array:
     return solve(animation, ShapeSet(rig.names, rig.neutral, rig.deltas), options).values
 
 
-def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:
+def key_frames(values: Array, tolerance: float) -> Indices:
     """Frames (N,) that are enough: between them, no curve is further than a tolerance from the straight line.
 
     The first and the last frame are among them. Douglas & Peucker, "Algorithms for the reduction of the number of
@@ -334,8 +333,8 @@ def key_frames(values: Array, tolerance: float) -> npt.NDArray[np.int64]:
 class Moving:
     """The shapes that move something, on the vertices that count."""
 
-    indices: npt.NDArray[np.int64]  # (K,) numbers of the shapes in the set
-    vertices: npt.NDArray[np.int64]  # (N,) vertices that count
+    indices: Indices  # (K,) numbers of the shapes in the set
+    vertices: Indices  # (N,) vertices that count
     area: Array  # (N,) their shares of the area, which sum to one
     deltas: Array  # (K, 3N) displacements
     energy: Array  # (K,) weighted mean square of each
@@ -390,7 +389,7 @@ def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions)
     return Moving(indices, vertices, area, deltas[indices], energy[indices])
 
 
-def vertex_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
+def vertex_areas(vertices: Floats, faces: Integers) -> Array:
     """A third of the area of every triangle around each vertex, (V,)."""
     thirds = np.repeat(triangle_areas(vertices, faces) / 3.0, 3)
     return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from facediff.utils.numerics import has_scipy, solve_block_chain
+from facediff.utils.numerics import Array, has_scipy, solve_block_chain
 
-Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 ACTIVE = 1e-3  # Share of the cost of a weight above which a shape is at work

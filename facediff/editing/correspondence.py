@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.editing.detached_parts import detached_parts, lash_pieces
 from facediff.editing.face_features import OPPOSITE, Features, find_features
@@ -22,12 +21,11 @@ from facediff.editing.surface import Nearest, Surface, nearest
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size, robust_align
 from facediff.mesh.mesh import check_coordinates, triangle_areas
+from facediff.utils.numerics import Array, Floats, Indices, Integers
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 # As much as the stiffest round: with less, the first rounds would pull the target away from its landmarks.
 LANDMARK_TRUST = 100.0
@@ -110,13 +108,13 @@ class Correspondence:
 
 
 def correspond(
-    source_vertices: npt.NDArray[np.floating],
-    source_faces: npt.NDArray[np.integer],
-    target_vertices: npt.NDArray[np.floating],
-    target_faces: npt.NDArray[np.integer],
+    source_vertices: Floats,
+    source_faces: Integers,
+    target_vertices: Floats,
+    target_faces: Integers,
     *,
-    landmarks: Landmarks | npt.NDArray[np.integer] | None = None,
-    face_triangles: npt.NDArray[np.integer] | None = None,
+    landmarks: Landmarks | Integers | None = None,
+    face_triangles: Integers | None = None,
 ) -> Correspondence:
     """Find the place on a source mesh of every vertex of a target mesh.
 
@@ -230,7 +228,7 @@ def placed(
     return back, features, target_features
 
 
-def _checked(name: str, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Surface:
+def _checked(name: str, vertices: Floats, faces: Integers) -> Surface:
     points: Array = np.ascontiguousarray(vertices, np.float64)
     corners: Indices = np.ascontiguousarray(faces, np.int64)
     check_coordinates(points, f"{name}:")
@@ -295,11 +293,7 @@ ROUNDED = 1e-4  # Files round coordinates; two places nearer than this share of 
 
 
 def refuse_other_mesh(
-    name: str,
-    vertices: npt.NDArray[np.floating],
-    faces: npt.NDArray[np.integer],
-    expected_vertices: npt.NDArray[np.floating],
-    expected_faces: npt.NDArray[np.integer],
+    name: str, vertices: Floats, faces: Integers, expected_vertices: Floats, expected_faces: Integers
 ) -> None:
     """Require the triangles of the mesh that a correspondence was made for; vertices may have moved."""
     if len(vertices) == len(expected_vertices) and np.array_equal(faces, expected_faces):
@@ -322,9 +316,7 @@ OTHER_FACE = 1e-3
 """Half of another face's vertices lie further off than this share of its extent; a sculpted nose moves fewer."""
 
 
-def refuse_other_face(
-    name: str, vertices: npt.NDArray[np.floating], expected_vertices: npt.NDArray[np.floating]
-) -> None:
+def refuse_other_face(name: str, vertices: Floats, expected_vertices: Floats) -> None:
     """Require the rest positions of a correspondence, except for sculpted details."""
     away = float(np.median(np.linalg.norm(vertices - expected_vertices, axis=1)))
     if away > OTHER_FACE * float(np.ptp(expected_vertices, axis=0).max()):

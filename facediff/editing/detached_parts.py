@@ -10,9 +10,8 @@ import numpy.typing as npt
 from facediff.editing.face_features import Features, Opening
 from facediff.editing.lid_transfer import LidEdges, along, lid_edges
 from facediff.editing.surface import Nearest, Surface, nearest
+from facediff.utils.numerics import Array, Indices
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
 ORAL = 0.9  # Pieces whose middle is so near to the mouth's, in its widths, are teeth or a tongue

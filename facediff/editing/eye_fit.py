@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import measured
@@ -14,9 +13,7 @@ from facediff.editing.correspondence import LIDS_AT_REST, Correspondence
 from facediff.editing.face_features import Features, FrontView
 from facediff.editing.lid_transfer import LidEdges, eyeball_depth, eyeball_triangles, lid_edges
 from facediff.editing.surface import Surface, triangle_normals
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from facediff.utils.numerics import Array, Floats, Integers
 
 BLINKS = 0.5  # An animation whose lids leave more than this share of the opening does not blink
 LEFT_OPEN = 0.2  # Share of an eye's opening that may still be seen at a full blink, beyond what the animation leaves
@@ -59,7 +56,7 @@ class EyeFigures:
 
 
 def check_eyes(
-    animation: Animation, carried: Animation, correspondence: Correspondence, frames: npt.NDArray[np.integer]
+    animation: Animation, carried: Animation, correspondence: Correspondence, frames: Integers
 ) -> tuple[EyeFigures | None, list[str], list[str]]:
     """Measure the upper face of a carried animation.
 
@@ -186,7 +183,7 @@ def raised_brows(animation: Animation, source: Features) -> int | None:
     return int((heights - animation.template[above, 1]).mean(axis=1).argmax())
 
 
-def _laid(correspondence: Correspondence, vertices: npt.NDArray[np.floating]) -> Array:
+def _laid(correspondence: Correspondence, vertices: Floats) -> Array:
     return correspondence.similarity.inverse().apply(np.asarray(vertices, np.float64))
 
 
@@ -252,7 +249,7 @@ def _forehead(
     rest: Surface,
     features: Features,
     source: Features,
-    frames: npt.NDArray[np.integer],
+    frames: Integers,
     correspondence: Correspondence | None,
 ) -> tuple[float, float]:
     """How much edges of the forehead grow or shrink, and the share of its moving triangles that turn over."""

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from facediff.utils.numerics import Array, Indices
+
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 WELD = 1e-6  # Vertices nearer than this share of the mesh's size are one: seams of textures do not part a mesh
 SAMPLES = 33  # points of each side of an opening, from corner to corner
@@ -189,7 +189,7 @@ class FrontView:
 
     def raster(
         self, triangles: Indices, low: Array, step: float, columns: int, rows: int
-    ) -> tuple[Indices, Array, npt.NDArray[np.float64]]:
+    ) -> tuple[Indices, Array, Array]:
         """The first triangle that each pixel's ray along z meets: its number (R, C), -1 for none, depth and weights."""
         points = self.vertices[self.faces[triangles]]
         flat = (points[:, :, :2] - low) / step

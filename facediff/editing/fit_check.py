@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.animation import measured
@@ -14,8 +13,7 @@ from facediff.editing.eye_fit import EyeFigures, check_eyes, fullest_blink, rais
 from facediff.editing.lid_transfer import lid_edges
 from facediff.editing.surface import Surface, nearest, triangle_normals
 from facediff.errors import OptionError
-
-Array = npt.NDArray[np.float64]
+from facediff.utils.numerics import Array, Floats, Integers
 
 FRAMES = 24  # As many frames, evenly spread, and the one with the widest mouth are looked at
 LIP_RATIO = 0.22
@@ -197,8 +195,8 @@ def _opened(grown: Array, expected: Array) -> float:
 def _torn(
     animation: Animation,
     carried: Animation,
-    pairs: npt.NDArray[np.integer],
-    facing: npt.NDArray[np.integer],
+    pairs: Integers,
+    facing: Integers,
     frame: int,
     matrix: Array,
     opening: float,
@@ -209,7 +207,7 @@ def _torn(
     return float(np.mean(np.linalg.norm(moved - expected, axis=2) > 0.5 * opening))
 
 
-def _gaps(frames: npt.NDArray[np.floating], pairs: npt.NDArray[np.integer]) -> Array:
+def _gaps(frames: Floats, pairs: Integers) -> Array:
     """Distances (T, P) of facing vertices."""
     return np.asarray(np.linalg.norm(np.float64(frames[:, pairs[:, 0]]) - frames[:, pairs[:, 1]], axis=2))
 
@@ -217,15 +215,15 @@ def _gaps(frames: npt.NDArray[np.floating], pairs: npt.NDArray[np.integer]) -> A
 def _crossed(
     animation: Animation,
     carried: Animation,
-    pairs: npt.NDArray[np.integer],
-    facing: npt.NDArray[np.integer],
-    frames: npt.NDArray[np.integer],
+    pairs: Integers,
+    facing: Integers,
+    frames: Integers,
     up: Array,
     scale: float,
 ) -> float:
     """How often the upper lip is a millimetre further below the lower one than at rest, where the original's is not."""
 
-    def heights(one: Animation, which: npt.NDArray[np.integer], axis: Array) -> tuple[Array, Array]:
+    def heights(one: Animation, which: Integers, axis: Array) -> tuple[Array, Array]:
         rest = np.float64(one.template[which[:, 0]]) - one.template[which[:, 1]]
         moved = np.float64(one.vertices[frames][:, which[:, 0]]) - one.vertices[frames][:, which[:, 1]]
         return moved @ axis, np.minimum(rest @ axis, 0.0)
@@ -237,7 +235,7 @@ def _crossed(
     return float(((heights_now < rest_now - scale * slack) & (source_heights > source_rest - 0.5 * slack)).mean())
 
 
-def _folded(animation: Animation, faces: npt.NDArray[np.integer], frames: npt.NDArray[np.integer]) -> float:
+def _folded(animation: Animation, faces: Integers, frames: Integers) -> float:
     """Share of the triangles that move which turn by more than a right angle in some frame."""
     rest = triangle_normals(np.asarray(animation.template, np.float64), faces)
     turned, moving = np.zeros(len(faces), bool), np.zeros(len(faces), bool)
@@ -249,7 +247,7 @@ def _folded(animation: Animation, faces: npt.NDArray[np.integer], frames: npt.ND
     return float((turned & moving).sum() / max(int(moving.sum()), 1))
 
 
-def _covered(animation: Animation, correspondence: Correspondence, frames: npt.NDArray[np.integer]) -> float:
+def _covered(animation: Animation, correspondence: Correspondence, frames: Integers) -> float:
     """Share of the animation's motion, summed over its vertices, that has the target's surface nearby."""
     motion = np.max(
         [np.linalg.norm(animation.vertices[frame] - animation.template, axis=1) for frame in frames], axis=0

@@ -12,17 +12,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.editing.face_features import Features, Opening, find_features
 from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
 from facediff.utils.limits import check_format, quoted
+from facediff.utils.numerics import Array, Floats, Indices, Integers
 from facediff.utils.plain_files import load_json, read_table, write_json
 from facediff.utils.records import Text, read_record
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 NAMES: dict[str, str] = {
     "nose_tip": "where the nose reaches furthest forward",
@@ -142,7 +139,7 @@ class LandmarkTemplate:
         return [name for name in NAMES if name not in self.vertices]
 
 
-def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> LandmarkTemplate:
+def known_landmarks(vertices: Floats, faces: Integers) -> LandmarkTemplate:
     """The named landmarks of a mesh, by its topology or by its shape.
 
     A topology is recognised by the number of its vertices, and by its landmarks: left and right must be mirror images,
@@ -163,7 +160,7 @@ def known_landmarks(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.in
     return LandmarkTemplate(None, landmarks_by_shape(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)))
 
 
-def known_topology(vertices: npt.NDArray[np.floating]) -> LandmarkTemplate | None:
+def known_topology(vertices: Floats) -> LandmarkTemplate | None:
     """The named places of a mesh of a known topology; None of another one."""
     points = np.asarray(vertices, np.float64)
     for topology, count, table in (
@@ -266,7 +263,7 @@ class SurfacePoints:
     weights: Array
 
     @classmethod
-    def of_vertices(cls, indices: npt.NDArray[np.integer]) -> SurfacePoints:
+    def of_vertices(cls, indices: Integers) -> SurfacePoints:
         """The places of vertices (L,)."""
         corners = np.repeat(np.asarray(indices, np.int64).reshape(-1, 1), 3, axis=1)
         return cls(corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
@@ -285,7 +282,7 @@ class Landmarks:
     target: SurfacePoints
 
     @classmethod
-    def of_vertices(cls, pairs: npt.NDArray[np.integer], names: Sequence[str] = ()) -> Landmarks:
+    def of_vertices(cls, pairs: Integers, names: Sequence[str] = ()) -> Landmarks:
         """Pairs (L, 2) of a source and a target vertex."""
         vertices = np.asarray(pairs, np.int64).reshape(-1, 2)
         return cls(
@@ -332,7 +329,7 @@ class Landmarks:
                     )
 
 
-def common_landmarks(source: npt.NDArray[np.floating], target: npt.NDArray[np.floating]) -> Landmarks | None:
+def common_landmarks(source: Floats, target: Floats) -> Landmarks | None:
     """The named pairs of two meshes (V, 3) of known topologies; None if one of them is another one."""
     templates = [known_topology(points) for points in (source, target)]
     if templates[0] is None or templates[1] is None:

@@ -11,15 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.editing.controls.eyelids import MEET
 from facediff.editing.face_features import LIDS, SAMPLES, Features, FrontView, Opening
 from facediff.editing.surface import Surface
-from facediff.utils.numerics import smooth_step
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from facediff.utils.numerics import Array, Floats, Indices, smooth_step
 
 REACH, SOURCE_REACH = 0.34, 0.5  # How far from a lid's edge the skin follows it, as a share of the eye's width
 EVENED = 0.2  # Towards the corners heights vanish: this share of the mean height keeps their ratios defined
@@ -72,7 +68,7 @@ class LidEdges:
     gaps: Array  # (SAMPLES, 3) from the lower to the upper edge, along the axes
     step: float  # median length of the triangles' edges along the lids
 
-    def displacements(self, vertices: npt.NDArray[np.floating], rest: npt.NDArray[np.floating] | float = 0.0) -> Array:
+    def displacements(self, vertices: Floats, rest: Floats | float = 0.0) -> Array:
         """Displacements (T, 2, SAMPLES, 3) of the edges, along the axes, from vertices (T, V, 3) and those at rest."""
         sides = []
         for rim, positions in zip(self.rims, self.positions, strict=True):

@@ -13,8 +13,7 @@ from facediff.editing.bounded import ACTIVE, Pivoting
 from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
-
-Array = npt.NDArray[np.float64]
+from facediff.utils.numerics import Array, Floats, Indices
 
 
 class FrameSolver:
@@ -51,7 +50,7 @@ class FrameSolver:
         frame_rate: ranges.FrameRate,
         *,
         faces: npt.NDArray[np.int32] | None = None,
-        regions: Mapping[str, npt.NDArray[np.int64]] | None = None,
+        regions: Mapping[str, Indices] | None = None,
         unit: str = "m",
         options: SolveOptions | None = None,
     ) -> None:
@@ -83,7 +82,7 @@ class FrameSolver:
         self._last = self._rest
         self._idle = np.full(len(self._scale), self._fading + 1)
 
-    def solve(self, offsets: npt.NDArray[np.floating]) -> Array:
+    def solve(self, offsets: Floats) -> Array:
         """The weights (K,) of the next frame, in the order of the shapes' names.
 
         Args:
@@ -106,7 +105,7 @@ class FrameSolver:
         weights[self._moving.indices] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
         return weights
 
-    def residual_mm(self, offsets: npt.NDArray[np.floating], weights: Array) -> float:
+    def residual_mm(self, offsets: Floats, weights: Array) -> float:
         """Root-mean-square distance over the vertices that count that weights (K,) leave of offsets (V, 3), in mm."""
         moving = self._moving
         left = np.asarray(offsets, np.float64)[moving.vertices].reshape(-1) - weights[moving.indices] @ moving.deltas

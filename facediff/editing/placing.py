@@ -6,7 +6,6 @@ import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.editing.face_features import Features, FrontView, find_features
 from facediff.editing.surface import Surface, nearest
@@ -15,12 +14,11 @@ from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size
 from facediff.mesh.alignment import TUKEY
 from facediff.mesh.flame import rotations
+from facediff.utils.numerics import Array
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 SAMPLES = 400  # Vertices of each mesh by which starts are compared
 FINE_SAMPLES = 1500  # Vertices of the moved mesh by which the alignment is refined

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from facediff.editing.bounded import Array, least_squares
+from facediff.editing.bounded import least_squares
+from facediff.utils.numerics import Array, Floats, Integers
 
 TemporalTerm = Literal["published", "corrected"]
 """How a weight is held near the last frame's: ``published`` has its factor of 100 on the left side only, which shrinks
@@ -71,10 +71,10 @@ class RegularisedSolver:
 
     def __init__(
         self,
-        neutral: npt.NDArray[np.floating],
-        deltas: npt.NDArray[np.floating],
+        neutral: Floats,
+        deltas: Floats,
         *,
-        mask: npt.NDArray[np.integer] | None = None,
+        mask: Integers | None = None,
         regularisation: Regularisation | None = None,
         active: Sequence[bool] | None = None,
         symmetric: Sequence[tuple[int, int]] = (),
@@ -109,7 +109,7 @@ class RegularisedSolver:
             + SYMMETRY * options.symmetry * difference.T @ difference
         )
 
-    def solve(self, vertices: npt.NDArray[np.floating]) -> Array:
+    def solve(self, vertices: Floats) -> Array:
         """Weights (T, K) of a motion, absolute vertices (T, V, 3); the face at rest goes before the first frame."""
         weights = np.zeros((len(vertices), len(self._factor)))
         last = np.zeros(len(self._used))

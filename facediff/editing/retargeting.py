@@ -17,9 +17,7 @@ from facediff.editing.correspondence import (
     LIDS_AS_ALL,
     LIDS_AT_REST,
     LIDS_FITTED,
-    Array,
     Correspondence,
-    Indices,
     averaging,
     correspond,
     placed,
@@ -43,6 +41,7 @@ from facediff.spaces.space import METRES
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic, check_writable
 from facediff.utils.limits import check_format
+from facediff.utils.numerics import Array, Floats, Indices, Integers
 
 T = TypeVar("T")
 
@@ -131,9 +130,7 @@ def retarget(
     return carried, correspondence
 
 
-def by_shape_or_names(
-    attempt: Callable[[Landmarks | None], T], source: npt.NDArray[np.floating], target: npt.NDArray[np.floating]
-) -> T:
+def by_shape_or_names(attempt: Callable[[Landmarks | None], T], source: Floats, target: Floats) -> T:
     """The result of an attempt without landmarks or, where that fails, with the named ones of both meshes (V, 3).
 
     These come second: a good fit needs none, and they are only known to a vertex, so that they would pull at it.
@@ -312,7 +309,7 @@ def _with_head(carried: Animation, head: Array | None, correspondence: Correspon
     return replace(carried, head=np.concatenate([turns, shifts], axis=1)) if whole_head else carried
 
 
-def transfer_displacements(correspondence: Correspondence, displacements: npt.NDArray[np.floating]) -> Array:
+def transfer_displacements(correspondence: Correspondence, displacements: Floats) -> Array:
     """Displacements of the source's vertices (T, Vs, 3) on the target's (T, Vt, 3), in its unit and axes.
 
     Each target vertex takes the weighted mean of its triangle's corners, turned and scaled by the similarity. Where
@@ -374,7 +371,7 @@ def unit_of(unit: str, scale: float) -> str:
     return near[0] if near else f"{metres:.6g}"
 
 
-def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integer]) -> Indices:
+def carried_region(correspondence: Correspondence, indices: Integers) -> Indices:
     """A region of the source on the target: vertices that lie more inside than out, and move."""
     member = np.zeros(len(correspondence.source_vertices))
     member[indices] = 1.0
@@ -383,7 +380,7 @@ def carried_region(correspondence: Correspondence, indices: npt.NDArray[np.integ
     return np.flatnonzero((inside > 0.5) & (correspondence.share > 0))
 
 
-def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer] | None) -> Indices | None:
+def carried_pairs(correspondence: Correspondence, pairs: Integers | None) -> Indices | None:
     """Pairs of facing vertices of the source as pairs of the target's vertices there, each pair once."""
     if pairs is None or not len(pairs):
         return None
@@ -392,7 +389,7 @@ def carried_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]
     return different if len(different) else None
 
 
-def facing_pairs(correspondence: Correspondence, pairs: npt.NDArray[np.integer]) -> Indices:
+def facing_pairs(correspondence: Correspondence, pairs: Integers) -> Indices:
     """For each pair (P, 2) of facing vertices of the source, a pair of the target's.
 
     Of the vertices that lie near to the source's and on the same lip, those two face each other that are

@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.animation import metres_per_unit
 from facediff.errors import FaceDiffError, OptionError, damaged
 from facediff.mesh import face_size, robust_align
 from facediff.spaces.arkit import absent_from, beyond_arkit
 from facediff.spaces.shape_files import ShapeFiles, read_shape_files
-
-Array = npt.NDArray[np.float64]
+from facediff.utils.numerics import Array, Floats
 
 ANOTHER_ORDER = 0.3
 """Vertices of neutral faces further apart than this share of the face's size are not in the same order."""
@@ -90,7 +88,7 @@ def check_shapes(path: Path) -> None:
         )
 
 
-def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
+def read_shapes(path: Path, template: Floats, unit: str = "m") -> ShapeSet:
     """Read a set of shapes for a face of the same topology.
 
     Args:
@@ -107,7 +105,7 @@ def read_shapes(path: Path, template: npt.NDArray[np.floating], unit: str = "m")
     return fitted(files, template, unit)
 
 
-def fitted(files: ShapeFiles, template: npt.NDArray[np.floating], unit: str = "m") -> ShapeSet:
+def fitted(files: ShapeFiles, template: Floats, unit: str = "m") -> ShapeSet:
     """Shapes as read, turned and scaled to a template by aligning their face at rest with it, if there is one."""
     if files.shapes.shape[1] != len(template):
         raise FaceDiffError(

@@ -8,16 +8,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.mesh import face_size
 from facediff.mesh.mesh import closest_on_triangles
+from facediff.utils.numerics import Array, Indices, Integers
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 SLACK = 0.04
 """A sheet that faces the same way is preferred to one that faces away and is nearer by up to this share of the face's
@@ -92,7 +90,7 @@ def vertex_normals(vertices: Array, faces: Indices) -> Array:
     return np.asarray(Trimesh(vertices, faces, process=False).vertex_normals, np.float64)
 
 
-def triangle_normals(points: Array, faces: npt.NDArray[np.integer]) -> Array:
+def triangle_normals(points: Array, faces: Integers) -> Array:
     """Normals (F, 3) of triangles, as long as twice their areas."""
     a, b, c = (points[faces[:, corner]] for corner in range(3))
     return np.asarray(np.cross(b - a, c - a))

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from facediff.utils.numerics import Array, Floats
 
 SAMPLES = 3000  # Vertices that are mirrored, at most
 ROUNDS = 25
@@ -28,7 +27,7 @@ class Plane:
         return np.asarray(points - 2.0 * away[:, None] * self.normal)
 
 
-def symmetry_plane(vertices: npt.NDArray[np.floating], start: Plane) -> Plane:
+def symmetry_plane(vertices: Floats, start: Plane) -> Plane:
     """The plane that mirrors a set of points onto itself best, searched for from a first guess.
 
     Mirror images are paired with their nearest points, and the best plane of the pairs is computed, in rounds: of pairs

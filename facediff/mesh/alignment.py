@@ -6,12 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from facediff.utils.numerics import Array, Floats, Indices, Integers
 
 TUKEY = 4.685
 """Residuals beyond this many scales have no weight (Holland and Welsch, 1977: 95 % efficient for normal residuals)."""
@@ -39,7 +36,7 @@ class Similarity:
     translation: Array
     scale: float = 1.0
 
-    def apply(self, points: npt.NDArray[np.floating]) -> Array:
+    def apply(self, points: Floats) -> Array:
         """Map points (..., 3), in float64."""
         return np.asarray(self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation)
 
@@ -53,13 +50,7 @@ class Similarity:
         return Similarity(following.rotation @ self.rotation, translation, following.scale * self.scale)
 
 
-def align(
-    source: npt.NDArray[np.floating],
-    target: npt.NDArray[np.floating],
-    *,
-    weights: npt.NDArray[np.floating] | None = None,
-    scale: bool = False,
-) -> Similarity:
+def align(source: Floats, target: Floats, *, weights: Floats | None = None, scale: bool = False) -> Similarity:
     """The map from source to target (both (N, 3)) with the least weighted sum of squared distances.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991. The
@@ -82,13 +73,7 @@ def align(
     return Similarity(rotation[0], translation[0], float(factor[0]))
 
 
-def robust_align(
-    source: npt.NDArray[np.floating],
-    target: npt.NDArray[np.floating],
-    *,
-    weights: npt.NDArray[np.floating] | None = None,
-    scale: bool = False,
-) -> Similarity:
+def robust_align(source: Floats, target: Floats, *, weights: Floats | None = None, scale: bool = False) -> Similarity:
     """The map from source to target that most points agree on; up to some 40 % of them may have moved.
 
     An MM-estimate: it starts from the triple of points with the least median residual (Rousseeuw, "Least median of
@@ -135,7 +120,7 @@ def robust_fit(
     return rotation, translation, factor
 
 
-def face_size(vertices: npt.NDArray[np.floating]) -> float:
+def face_size(vertices: Floats) -> float:
     """Size of a set of points (N, 3): their root-mean-square distance from their mean."""
     centred = np.asarray(vertices, np.float64) - np.mean(vertices, axis=0, dtype=np.float64)
     return float(np.sqrt(np.square(centred).sum(axis=-1).mean()))
@@ -198,9 +183,7 @@ def _residuals(source: Array, target: Array, rotation: Array, translation: Array
     return np.sqrt(np.einsum("bni,bni->bn", left, left))
 
 
-def _checked(
-    source: npt.NDArray[np.floating], target: npt.NDArray[np.floating], weights: npt.NDArray[np.floating] | None
-) -> tuple[Array, Array, Array]:
+def _checked(source: Floats, target: Floats, weights: Floats | None) -> tuple[Array, Array, Array]:
     points: Array = np.asarray(source, np.float64)
     goal: Array = np.asarray(target, np.float64)
     return points, goal, np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
@@ -228,18 +211,18 @@ class RigidMotion:
         residuals: (T,) root-mean-square distance of the stable vertices from the target that is left.
     """
 
-    frames: npt.NDArray[np.floating]
+    frames: Floats
     rotations: Array
     translations: Array
     residuals: Array
 
 
 def remove_rigid_motion(
-    frames: npt.NDArray[np.floating],
-    target: npt.NDArray[np.floating],
+    frames: Floats,
+    target: Floats,
     stable: Indices | None = None,
     *,
-    out: npt.NDArray[np.floating] | None = None,
+    out: Floats | None = None,
     chunk_bytes: int = CHUNK_BYTES,
 ) -> RigidMotion:
     """Align every frame with the target by rotation and translation, each by a robust fit of the stable vertices.
@@ -270,7 +253,7 @@ def remove_rigid_motion(
     return RigidMotion(out, rotations, translations, residuals)
 
 
-def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST, sample: int = SAMPLE) -> Indices:
+def stable_vertices(frames: Floats, *, share: float = STILLEST, sample: int = SAMPLE) -> Indices:
     """The vertices that move least against one another: skull, forehead, bridge of the nose.
 
     Frames evenly spread over the sequence are aligned with their median by a robust fit of all vertices; the stillest
@@ -299,7 +282,7 @@ def stable_vertices(frames: npt.NDArray[np.floating], *, share: float = STILLEST
     return stable
 
 
-def median_face(frames: npt.NDArray[np.floating], stable: Indices | None = None, *, sample: int = SAMPLE) -> Array:
+def median_face(frames: Floats, stable: Indices | None = None, *, sample: int = SAMPLE) -> Array:
     """The median over frames of every vertex (V, 3), without the head's rigid motion; centred at the origin.
 
     It has the pose of the frame in the middle, and serves as a template where there is none.
@@ -314,7 +297,7 @@ def median_face(frames: npt.NDArray[np.floating], stable: Indices | None = None,
     return median - median.mean(axis=0)
 
 
-def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[slice, Array]]:
+def chunks(frames: Floats, chunk_bytes: int = CHUNK_BYTES) -> Iterator[tuple[slice, Array]]:
     """Consecutive pieces of (T, V, 3) as float64 copies, each with its slice of frames; a frame with NaN is refused."""
     step = max(1, chunk_bytes // (24 * frames.shape[1]))
     for first in range(0, len(frames), step):
@@ -323,14 +306,14 @@ def chunks(frames: npt.NDArray[np.floating], chunk_bytes: int = CHUNK_BYTES) -> 
         yield slice(first, first + len(chunk)), chunk
 
 
-def _refuse_not_finite(frames: Array, numbers: npt.NDArray[np.integer]) -> None:
+def _refuse_not_finite(frames: Array, numbers: Integers) -> None:
     finite = np.isfinite(frames).all(axis=(1, 2))
     if not finite.all():
         frame = int(numbers[np.argmin(finite)])
         raise FaceDiffError(f"frame {frame} (counted from 0) holds NaN or infinity; repair or remove it")
 
 
-def _sample(frames: npt.NDArray[np.floating], sample: int) -> Array:
+def _sample(frames: Floats, sample: int) -> Array:
     """Evenly spread frames, each moved to the origin."""
     numbers = np.unique(np.linspace(0, len(frames) - 1, min(sample, len(frames))).round().astype(int))
     some = np.array(frames[numbers], np.float64)

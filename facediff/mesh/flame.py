@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, check_known, damaged
 from facediff.utils.arrays import read_arrays
+from facediff.utils.numerics import Array, Floats, Indices
 from facediff.utils.pickles import StandIn, load_pickle
 
 SHAPES, EXPRESSIONS, JOINTS = 300, 100, 5
@@ -24,7 +25,6 @@ POSE_FEATURES = 9 * (JOINTS - 1)
 JAW = 2  # Joints are in this order: root, neck, jaw, left eye, right eye
 CHUNK = 32  # Frames that are computed at a time: their vertices stay in a processor's cache
 
-Array = npt.NDArray[np.float64]
 Values = npt.NDArray[np.generic]
 
 
@@ -75,19 +75,12 @@ class Flame:
         """Vertices of the mesh."""
         return len(self.template)
 
-    def shaped(self, shape: npt.NDArray[np.floating]) -> Array:
+    def shaped(self, shape: Floats) -> Array:
         """The face (V, 3) of shape coefficients (S,) at rest, eq. 8; S may be less than the model has, but not more."""
         coefficients = np.asarray(shape, np.float64)
         return np.asarray(self.template + (self._shape_basis[:, : len(coefficients)] @ coefficients).reshape(-1, 3))
 
-    def vertices(
-        self,
-        shape: npt.NDArray[np.floating],
-        expression: npt.NDArray[np.floating],
-        jaw: npt.NDArray[np.floating],
-        *,
-        head: npt.NDArray[np.floating] | None = None,
-    ) -> Array:
+    def vertices(self, shape: Floats, expression: Floats, jaw: Floats, *, head: Floats | None = None) -> Array:
         """Vertices (T, V, 3) in metres, without rotation of neck and eyes, eqs. 2 to 10.
 
         Joints are regressed from shape and expression together, as in the published implementations.
@@ -124,7 +117,7 @@ class Flame:
         return result
 
 
-def rotations(axis_angles: npt.NDArray[np.floating]) -> Array:
+def rotations(axis_angles: Floats) -> Array:
     """Rotation matrices (T, 3, 3) of axis-angle vectors (T, 3) in radians, by Rodrigues' formula, eq. 1.
 
     Example:
@@ -158,12 +151,12 @@ HELP = "expected generic_model.pkl of FLAME 2020, from flame.is.tue.mpg.de, as i
 class FlameArrays:
     """Content of a model file as plain arrays; V vertices, F triangles."""
 
-    template: npt.NDArray[np.float64]  # (V, 3) mean face, in metres
-    directions: npt.NDArray[np.float64]  # (V, 3, 400) 300 directions of shape, then 100 of expression
-    pose_directions: npt.NDArray[np.float64]  # (V, 3, 36) correctives, nine for each joint but the root
-    joint_regressor: npt.NDArray[np.float64]  # (5, V) from vertices to joints
-    parents: npt.NDArray[np.int64]  # (5,) parent of each joint; −1 for the root
-    weights: npt.NDArray[np.float64]  # (V, 5) skinning weights
+    template: Array  # (V, 3) mean face, in metres
+    directions: Array  # (V, 3, 400) 300 directions of shape, then 100 of expression
+    pose_directions: Array  # (V, 3, 36) correctives, nine for each joint but the root
+    joint_regressor: Array  # (5, V) from vertices to joints
+    parents: Indices  # (5,) parent of each joint; −1 for the root
+    weights: Array  # (V, 5) skinning weights
     faces: npt.NDArray[np.int32]  # (F, 3) vertex indices
 
 
@@ -217,9 +210,7 @@ def read_tensors(path: Path) -> object:
     return {name: value.numpy() for name, value in inner.items() if hasattr(value, "numpy")}
 
 
-def _numbers(
-    content: Mapping[Any, Any], key: str, path: Path, shape: tuple[int | None, ...]
-) -> npt.NDArray[np.float64]:
+def _numbers(content: Mapping[Any, Any], key: str, path: Path, shape: tuple[int | None, ...]) -> Array:
     """An array of the file as float64, with its shape checked; None stands for any length but zero."""
     values = plain_array(content[key], f"{path}: {key}")
     as_expected = len(values.shape) == len(shape) and all(

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, damaged
-from facediff.mesh.mesh import Array
+from facediff.utils.numerics import Array, Indices
 from facediff.utils.plain_files import parse_json, read_bytes
 
 TYPES: dict[int, np.dtype[Any]] = {
@@ -149,7 +149,7 @@ class Glb:
         """Vertices (V, 3) of a primitive."""
         return self.numbers(attributes(primitive).get("POSITION"), "VEC3", POSITIONS).astype(np.float64)
 
-    def triangles(self, primitive: dict[str, Any], n_vertices: int) -> npt.NDArray[np.int64]:
+    def triangles(self, primitive: dict[str, Any], n_vertices: int) -> Indices:
         """Triangles (F, 3) of a primitive: a list, a strip or a fan of them."""
         mode = whole_number(primitive, "mode", TRIANGLES)
         if primitive.get("indices") is None:

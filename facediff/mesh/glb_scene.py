@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.mesh.glb import Glb, attributes, whole_number
-from facediff.mesh.mesh import Array, Mesh
+from facediff.mesh.mesh import Mesh
 from facediff.utils.colours import to_srgb
 from facediff.utils.limits import COORDINATE, in_range
+from facediff.utils.numerics import Array, Indices
 
 ALIKE = 1e-5
 """Matrices of a skin that differ by less than this share are one: it is in the pose that it was bound in."""
@@ -48,7 +48,7 @@ class Placed:
     material: dict[str, Any]
     local: Array
     matrix: Array | None
-    faces: npt.NDArray[np.int64]
+    faces: Indices
 
     @property
     def turn(self) -> Array:
@@ -74,7 +74,7 @@ class Placed:
 def placed_parts(glb: Glb) -> Iterator[Placed]:
     """The primitives with triangles of a file's scene, in the order in which :func:`read_glb` joins them."""
     materials, nodes = glb.entries("materials"), placed_nodes(glb)
-    read: dict[int, list[tuple[dict[str, Any], Array, npt.NDArray[np.int64]]]] = {}  # several nodes may show a mesh
+    read: dict[int, list[tuple[dict[str, Any], Array, Indices]]] = {}  # several nodes may show a mesh
     skins: dict[int, Array] = {}
     skinned: dict[tuple[int, int], Array | None] = {}
     for mesh, node in _shown(glb, nodes):

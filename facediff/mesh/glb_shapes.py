@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.mesh.glb import POSITIONS, TRIANGLES, Glb
 from facediff.mesh.glb_scene import Placed, placed_parts
 from facediff.mesh.mesh import check_coordinates
-
-Array = npt.NDArray[np.float64]
+from facediff.utils.numerics import Array, Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +23,7 @@ class Targets:
     names: tuple[str, ...]  # (K,)
     neutral: Array  # (V, 3) in metres
     deltas: Array  # (K, V, 3)
-    faces: npt.NDArray[np.int64]  # (F, 3)
+    faces: Indices  # (F, 3)
 
 
 def read_targets(glb: Glb, vertices: int | None = None) -> Targets:

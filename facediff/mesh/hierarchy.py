@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import needs_extra
-from facediff.mesh.mesh import Array
-from facediff.mesh.spirals import Indices, Points, checked_faces, spirals
+from facediff.mesh.spirals import checked_faces, spirals
+from facediff.utils.numerics import Array, Floats, Indices, Integers
 
 Pooling = Literal["select", "mean"]
 
@@ -24,7 +24,7 @@ class Operator:
     weights: npt.NDArray[np.float32]  # (N,) float32, none negative; those of a row sum to one
     shape: tuple[int, int]  # vertices after and before the map
 
-    def apply(self, values: npt.NDArray[np.floating]) -> Array:
+    def apply(self, values: Floats) -> Array:
         """The map of values (shape[1], ...) in float64."""
         values = np.asarray(values, np.float64)
         scaled = values[self.columns] * self.weights.reshape(-1, *[1] * (values.ndim - 1)).astype(np.float64)
@@ -60,8 +60,8 @@ class MeshHierarchy:
 
 
 def mesh_hierarchy(
-    template: Points,
-    faces: npt.NDArray[np.integer],
+    template: Floats,
+    faces: Integers,
     levels: int = 3,
     factor: int = 4,
     spiral_length: int = 12,
@@ -116,7 +116,7 @@ class Coarse:
     down: Operator  # from the V vertices to the M coarse ones
 
 
-def coarsen(template: Points, faces: npt.NDArray[np.integer], n_vertices: int, pooling: Pooling = "select") -> Coarse:
+def coarsen(template: Floats, faces: Integers, n_vertices: int, pooling: Pooling = "select") -> Coarse:
     """Reduce a mesh (V, 3), (F, 3) in any unit to exactly ``n_vertices`` vertices.
 
     Edges are collapsed by Garland and Heckbert's quadric error ("Surface simplification using quadric error metrics",

@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import COORDINATE, in_range
-
-Array = npt.NDArray[np.float64]
+from facediff.utils.numerics import Array, Floats, Integers
 
 
 @dataclass(frozen=True)
@@ -23,12 +22,12 @@ class Mesh:
         colours: (V, 3) vertex colours, sRGB; None if the file has none.
     """
 
-    vertices: npt.NDArray[np.float64]
+    vertices: Array
     faces: npt.NDArray[np.int32]
     colours: npt.NDArray[np.uint8] | None = None
 
 
-def check_coordinates(points: npt.NDArray[np.floating], source: object) -> None:
+def check_coordinates(points: Floats, source: object) -> None:
     """Refuse positions or displacements that are not finite, or so large that computing with them overflows."""
     if not in_range(points):
         raise FaceDiffError(
@@ -36,7 +35,7 @@ def check_coordinates(points: npt.NDArray[np.floating], source: object) -> None:
         )
 
 
-def triangle_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
+def triangle_areas(vertices: Floats, faces: Integers) -> Array:
     """Area (F,) of every triangle of a mesh: vertices (V, 3), faces (F, 3); in the square of the vertices' unit."""
     first, second, third = (np.asarray(vertices, np.float64)[faces[:, corner]] for corner in range(3))
     (ax, ay, az), (bx, by, bz) = (second - first).T, (third - first).T
@@ -44,7 +43,7 @@ def triangle_areas(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.int
     return np.asarray(0.5 * np.sqrt(square))
 
 
-def surface_area(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> float:
+def surface_area(vertices: Floats, faces: Integers) -> float:
     """Area of a triangle mesh, which is also the sum of its vertices' mixed Voronoi areas."""
     return float(triangle_areas(vertices, faces).sum())
 

@@ -21,7 +21,8 @@ import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, damaged
 from facediff.mesh.glb_scene import read_glb
-from facediff.mesh.mesh import Array, Mesh, check_coordinates
+from facediff.mesh.mesh import Mesh, check_coordinates
+from facediff.utils.numerics import Array, Indices
 from facediff.utils.plain_files import read_bytes
 
 HEADER = 1 << 16  # bytes within which a PLY header must end
@@ -108,7 +109,7 @@ def _triangles(lines: bytes, n_vertices: int) -> Triangles:
     return _checked(np.array(triangles, np.int64), n_vertices)
 
 
-def _checked(faces: npt.NDArray[np.int64], n_vertices: int) -> Triangles:
+def _checked(faces: Indices, n_vertices: int) -> Triangles:
     """Triangles as (F, 3), refused if a vertex does not exist."""
     if faces.size and (faces.min() < 0 or faces.max() >= n_vertices):
         raise ValueError(f"a face names a vertex that does not exist among {n_vertices}")

@@ -8,11 +8,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import OptionError, choices, damaged
 from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
+from facediff.utils.numerics import Indices
 from facediff.utils.plain_files import read_bytes
 
 NAMING = {b"o": 0, b"g": 1, b"usemtl": 2}
@@ -23,7 +23,7 @@ class MeshPart:
     """Triangles that have names in common."""
 
     names: tuple[str, ...]
-    triangles: npt.NDArray[np.int64]  # numbers of the triangles of the mesh that `read_mesh` reads
+    triangles: Indices  # numbers of the triangles of the mesh that `read_mesh` reads
 
 
 def mesh_parts(path: Path) -> list[MeshPart]:
@@ -41,7 +41,7 @@ def mesh_parts(path: Path) -> list[MeshPart]:
     return parts
 
 
-def named_triangles(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
+def named_triangles(path: Path, names: Sequence[str]) -> Indices:
     r"""The triangles of a file's mesh that lie in parts with these names; ``*`` stands for any letters.
 
     Example:

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
-
-Indices = npt.NDArray[np.int64]
-Points = npt.NDArray[np.floating]
+from facediff.utils.numerics import Floats, Indices, Integers
 
 
 def spirals(
-    faces: npt.NDArray[np.integer],
-    n_vertices: int,
-    length: int,
-    dilation: int = 1,
-    template: Points | None = None,
+    faces: Integers, n_vertices: int, length: int, dilation: int = 1, template: Floats | None = None
 ) -> Indices:
     """Every vertex followed by the vertices on the rings around it, ring by ring.
 
@@ -55,7 +48,7 @@ def spirals(
     return table
 
 
-def checked_faces(faces: npt.NDArray[np.integer], n_vertices: int) -> Indices:
+def checked_faces(faces: Integers, n_vertices: int) -> Indices:
     """Faces (F, 3) as int64, without degenerate ones; refuses indices beyond the vertices."""
     corners = np.asarray(faces, np.int64).reshape(-1, 3)
     if corners.size and not (corners.min() >= 0 and corners.max() < n_vertices):
@@ -124,7 +117,7 @@ def _spiral(vertex: int, rings: list[list[int]], full_length: int) -> list[int]:
     return spiral[:full_length]
 
 
-def _nearest(vertex: int, spiral: list[int], full_length: int, template: Points | None) -> list[int]:
+def _nearest(vertex: int, spiral: list[int], full_length: int, template: Floats | None) -> list[int]:
     """The vertices nearest to ``vertex`` that are not in the spiral, as many as it lacks."""
     assert template is not None  # noqa: S101 - for type checkers
     square = np.square(np.asarray(template, np.float64) - np.asarray(template[vertex], np.float64)).sum(axis=1)

@@ -21,6 +21,7 @@ from facediff.mesh.glb import Glb, attributes, open_glb, whole_number
 from facediff.mesh.glb_scene import placed_parts
 from facediff.utils.colours import to_srgb
 from facediff.utils.limits import in_range
+from facediff.utils.numerics import Array, Indices, Integers
 
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
 """How pictures begin that programs for glTF and USD read, their type and suffix."""
@@ -55,18 +56,18 @@ class Textures:
         losses: properties that are not carried over, a sentence each.
     """
 
-    uvs: npt.NDArray[np.float64]
-    corners: npt.NDArray[np.int64]
+    uvs: Array
+    corners: Indices
     materials: tuple[Material, ...]
-    of_face: npt.NDArray[np.int64]
+    of_face: Indices
     losses: tuple[str, ...] = ()
 
-    def turned(self, triangles: npt.NDArray[np.integer], outward: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+    def turned(self, triangles: Integers, outward: Integers) -> Indices:
         """The corners for the same triangles (F, 3) with their vertices in another order."""
         order = (outward[:, :, None] == triangles[:, None, :]).argmax(axis=2)
         return np.take_along_axis(self.corners, order, axis=1)
 
-    def at_vertices(self, triangles: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.uint8]:
+    def at_vertices(self, triangles: Integers, count: int) -> npt.NDArray[np.uint8]:
         """Colours (count, 3) of the vertices of the triangles (F, 3): of the pictures, or else of the materials."""
         with needs_extra("PIL", "render", "reading pictures"):
             from PIL import Image

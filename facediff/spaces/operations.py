@@ -8,16 +8,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.spaces.rotations import convert, slerp
 from facediff.spaces.space import WIDTHS, Form, Rotation, Space
 from facediff.utils import ranges
 from facediff.utils.limits import quoted
+from facediff.utils.numerics import Array, Floats
 
-Array = npt.NDArray[np.float64]
-Values = npt.NDArray[np.floating]
+Values = Floats
 
 FLOOR = 1e-4
 """Standard deviation below which a channel counts as dead, as a share of the largest one."""

@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError
 from facediff.mesh.flame import EXPRESSIONS, Flame
@@ -17,9 +16,9 @@ from facediff.spaces.arkit import ARKIT, absent_from, plain
 from facediff.spaces.rotations import convert
 from facediff.spaces.shape_files import ICT_NEUTRAL, read_shape_files
 from facediff.spaces.space import Space
+from facediff.utils.numerics import Array, Floats, Integers
 
-Array = npt.NDArray[np.float64]
-Values = npt.NDArray[np.floating]
+Values = Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class LinearRig:
     names: tuple[str, ...]
     neutral: Array
     deltas: Array
-    faces: npt.NDArray[np.integer] | None = None
+    faces: Integers | None = None
     unit: str = "m"
     title: str = ""
 

@@ -7,16 +7,14 @@ Angles are in radians; matrices act on columns.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.spaces.space import Form
-
-Array = npt.NDArray[np.float64]
+from facediff.utils.numerics import Array, Floats
 
 SMALL = 1e-8  # Angle below which sin(a / 2) / a is its limit
 
 
-def convert(values: npt.NDArray[np.floating], source: Form, target: Form) -> Array:
+def convert(values: Floats, source: Form, target: Form) -> Array:
     """Rotations (..., width of the source's form) in another form (..., width of the target's).
 
     Axis-angle vectors come back with an angle of at most π, quaternions with w of at least 0.

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, damaged
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_shapes import read_targets
 from facediff.spaces.arkit import arkit_name, plain
+from facediff.utils.numerics import Floats, Integers
 
 NEUTRAL = ("neutral", "basis", "rest", "base", "template", "genericneutralmesh")
 """Names (without case and punctuation) of the face at rest in a set of shapes."""
@@ -32,9 +32,9 @@ class ShapeFiles:
     path: Path  # the folder or the file
     first: Path  # the file to name where the topology is wrong
     names: tuple[str, ...]  # K names as written
-    shapes: npt.NDArray[np.floating]  # (K, V, 3) vertices of each shape
-    neutral: npt.NDArray[np.floating] | None  # (V, 3) the face at rest; None if there is none
-    faces: npt.NDArray[np.integer] | None  # (F, 3) triangles; None if there are none
+    shapes: Floats  # (K, V, 3) vertices of each shape
+    neutral: Floats | None  # (V, 3) the face at rest; None if there is none
+    faces: Integers | None  # (F, 3) triangles; None if there are none
     metric: bool = False  # whether lengths are in metres by definition of the format, as in .glb
     rest: str = ""  # name of the file with the face at rest
     notes: tuple[str, ...] = ()  # changes since reading, a sentence each

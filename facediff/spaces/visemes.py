@@ -13,14 +13,14 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.spaces.arkit import ALPHABETICAL, LEFT_AND_RIGHT
 from facediff.spaces.layouts import layout
 from facediff.spaces.operations import permuted
 from facediff.spaces.space import Space
+from facediff.utils.numerics import Array, Floats
 
-Values = npt.NDArray[np.floating]
+Values = Floats
 VisemeSet = Literal["oculus", "vrm"]
 
 RIDGE = 0.02
@@ -51,7 +51,7 @@ SETS: dict[str, tuple[str, ...]] = {"oculus": ("sil", *OCULUS), "vrm": (*VRM, *B
 """Names of the visemes of each set, in order."""
 
 
-def poses(viseme_set: VisemeSet) -> npt.NDArray[np.float64]:
+def poses(viseme_set: VisemeSet) -> Array:
     """The poses (K, 52) of a set, in ARKit's alphabetical order; without sil and blinks."""
     rows = []
     for pose in (OCULUS if viseme_set == "oculus" else VRM).values():
@@ -65,7 +65,7 @@ def poses(viseme_set: VisemeSet) -> npt.NDArray[np.float64]:
 
 
 @lru_cache(maxsize=2)
-def viseme_map(viseme_set: VisemeSet) -> npt.NDArray[np.float64]:
+def viseme_map(viseme_set: VisemeSet) -> Array:
     """The linear map (52, K) from weights in ARKit's alphabetical order; see the module."""
     rows = poses(viseme_set)
     return np.asarray(rows.T @ np.linalg.inv(rows @ rows.T + RIDGE * np.eye(len(rows))))

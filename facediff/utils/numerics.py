@@ -12,6 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.floating]
+Integers = npt.NDArray[np.integer]
 
 CHUNK = 2**22
 """Distances that are held in memory at a time."""

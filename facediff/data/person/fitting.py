@@ -22,10 +22,11 @@ from facediff.data.person.face_sequences import (
 from facediff.data.track.face import pair_distances
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
-from facediff.mesh.alignment import Indices, chunks
+from facediff.mesh.alignment import chunks
 from facediff.metrics import LipPairs
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.utils.arrays import open_array
+from facediff.utils.numerics import Indices
 
 Speech = npt.NDArray[np.float32]
 

@@ -11,9 +11,10 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.animation import metres_per_unit
 from facediff.editing.controls.expressiveness import ALL, region_factors
-from facediff.editing.controls.eyelids import Array, Eyes
+from facediff.editing.controls.eyelids import Eyes
 from facediff.editing.controls.procedural import copied
 from facediff.errors import OptionError
+from facediff.utils.numerics import Array, Floats, Integers
 
 REGION = "brows"
 """Name of the region with the vertices of the brows."""
@@ -28,11 +29,7 @@ class Brows:
 
 
 def brows_of(
-    template: npt.NDArray[np.floating],
-    faces: npt.NDArray[np.integer] | None,
-    regions: Mapping[str, npt.NDArray[np.integer]],
-    unit: str,
-    eyes: Eyes | None = None,
+    template: Floats, faces: Integers | None, regions: Mapping[str, Integers], unit: str, eyes: Eyes | None = None
 ) -> Brows:
     """The brows of a face (V, 3).
 
@@ -57,12 +54,7 @@ def brows_of(
 
 
 def carried(
-    name: str,
-    neutral: Array,
-    triangles: npt.NDArray[np.integer],
-    fields: Array,
-    template: npt.NDArray[np.floating],
-    faces: npt.NDArray[np.integer] | None,
+    name: str, neutral: Array, triangles: Integers, fields: Array, template: Floats, faces: Integers | None
 ) -> Array:
     """Displacements (K, V, 3) of a built-in face on another one, in its unit; refused if no face is found in it."""
     from facediff.editing.correspondence import correspond
@@ -94,7 +86,7 @@ def _one_millimetre(field: npt.ArrayLike, unit: str) -> npt.NDArray[np.float32]:
     return np.asarray(displacements * (0.001 / metres_per_unit(unit) / largest), np.float32)
 
 
-def raise_brows(animation: Animation, brows: Brows, curve: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+def raise_brows(animation: Animation, brows: Brows, curve: Floats) -> npt.NDArray[np.float32]:
     """Vertices (T, V, 3) with brows raised by millimetres (T,), or lowered where these are negative."""
     vertices = copied(animation.vertices)
     for index in np.flatnonzero(curve):

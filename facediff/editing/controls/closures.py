@@ -9,10 +9,9 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.animation.animation import measured, metres_per_unit
 from facediff.editing.controls.expressiveness import ALL, region_factors
-from facediff.editing.controls.eyelids import Array
 from facediff.editing.controls.procedural import EDITED, copied, with_metadata
 from facediff.errors import FaceDiffError
-from facediff.utils.numerics import smooth_step
+from facediff.utils.numerics import Array, smooth_step
 
 RAMP = 0.08
 """Seconds in which lips come together, and part again."""

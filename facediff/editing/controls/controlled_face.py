@@ -19,9 +19,10 @@ from facediff.animation import Animation
 from facediff.editing.controls import keys_of, procedural
 from facediff.editing.controls.direction import METADATA, Direction, channel_of, curve, direction_of
 from facediff.editing.controls.expressiveness import ALL, check_factors, read_factors, scaled_regions
-from facediff.editing.controls.eyelids import GIVE, Array, Eyes, eyes_for
+from facediff.editing.controls.eyelids import GIVE, Eyes, eyes_for
 from facediff.editing.controls.procedural import EDITED, PROCEDURAL, SWAYS, Amount, in_words, with_metadata
 from facediff.errors import FaceDiffError, OptionError
+from facediff.utils.numerics import Array, Floats, Integers
 
 if TYPE_CHECKING:
     from facediff.animation.options import AnimationControls
@@ -74,9 +75,9 @@ class ControlledFace:
         self,
         controls: AnimationControls,
         direction: Direction | None,
-        template: npt.NDArray[np.floating],
-        faces: npt.NDArray[np.integer] | None,
-        regions: Mapping[str, npt.NDArray[np.integer]],
+        template: Floats,
+        faces: Integers | None,
+        regions: Mapping[str, Integers],
         unit: str,
         name: str,
     ) -> None:
@@ -102,7 +103,7 @@ class ControlledFace:
         channels = () if self.direction is None else self.direction.under(name)
         return {channel: channel.partition(".")[2] or ALL for channel in channels}
 
-    def _needed_eyes(self, template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None) -> Eyes | None:
+    def _needed_eyes(self, template: Floats, faces: Integers | None) -> Eyes | None:
         """The face's eyes, if anything needs them; some controls only work better where they are known."""
         controls, keyed = self.controls, {} if self.direction is None else self.direction.channels
         lids = "{blinks}" if controls.blinks is not None else next((n for n in ("blinks", "lids") if n in keyed), None)

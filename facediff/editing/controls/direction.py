@@ -21,6 +21,7 @@ from facediff.spaces.arkit import ARKIT, LEFT_AND_RIGHT
 from facediff.utils import ranges
 from facediff.utils.hints import Range, check_number, shown
 from facediff.utils.limits import check_format, quoted
+from facediff.utils.numerics import Array
 from facediff.utils.paths import from_home
 from facediff.utils.plain_files import json_text, load_json, parse_json, read_columns, write_json, write_rows
 from facediff.utils.records import read_record
@@ -28,7 +29,6 @@ from facediff.utils.records import read_record
 if TYPE_CHECKING:
     from facediff.animation import Animation
 
-Array = npt.NDArray[np.float64]
 
 Interpolation = Literal["step", "linear", "smooth"]
 """Interpolation from a key to the next one: constant, a line, or a smooth curve."""

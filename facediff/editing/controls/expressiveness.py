@@ -12,10 +12,10 @@ import numpy.typing as npt
 from facediff.animation import Animation
 from facediff.animation.animation import allocate_like
 from facediff.animation.options import Scales, scales_text
-from facediff.editing.controls.eyelids import Array, Eyes
+from facediff.editing.controls.eyelids import Eyes
 from facediff.errors import OptionError, check_known
 from facediff.utils.hints import Range, read
-from facediff.utils.numerics import nearest_distances, smooth_step
+from facediff.utils.numerics import Array, Floats, Integers, nearest_distances, smooth_step
 
 ALL = "all"  # The name of all vertices that no other name is given for
 FALL_OFF = 0.06
@@ -57,7 +57,7 @@ def check_factors(factors: Iterable[str], regions: Mapping[str, object], name: s
 
 
 def scaled_regions(
-    animation: Animation, factors: Mapping[str, float | npt.NDArray[np.floating]], eyes: Eyes | None = None
+    animation: Animation, factors: Mapping[str, float | Floats], eyes: Eyes | None = None
 ) -> npt.NDArray[np.float32]:
     """Vertices (T, V, 3) that go further from the neutral face, or less far; the head must not sway yet.
 
@@ -103,8 +103,8 @@ class RegionWeights:
 
 
 def region_factors(
-    template: npt.NDArray[np.floating],
-    regions: Mapping[str, npt.NDArray[np.integer]],
+    template: Floats,
+    regions: Mapping[str, Integers],
     factors: Mapping[str, float],
     name: str = "expressiveness",
     fall_off: float | None = None,
@@ -128,8 +128,8 @@ def region_factors(
 
 
 def region_weights(
-    template: npt.NDArray[np.floating],
-    regions: Mapping[str, npt.NDArray[np.integer]],
+    template: Floats,
+    regions: Mapping[str, Integers],
     names: Sequence[str],
     name: str = "expressiveness",
     fall_off: float | None = None,
@@ -152,7 +152,7 @@ def region_weights(
     return RegionWeights(region_names, weights, np.clip(1.0 - total, 0.0, None))
 
 
-def with_jaw(points: Array, regions: Mapping[str, npt.NDArray[np.integer]]) -> npt.NDArray[np.integer]:
+def with_jaw(points: Array, regions: Mapping[str, Integers]) -> Integers:
     """The lips and all vertices below them (V,): lips that open further by themselves leave the chin behind."""
     lips, brows = regions["lips"], regions.get("upper_face", ())
     if not len(lips) or not len(brows):
@@ -162,9 +162,7 @@ def with_jaw(points: Array, regions: Mapping[str, npt.NDArray[np.integer]]) -> n
     return np.union1d(lips, np.flatnonzero(depth > depth[lips].max()))
 
 
-def rest_weights(
-    template: npt.NDArray[np.floating], regions: Mapping[str, npt.NDArray[np.integer]]
-) -> npt.NDArray[np.float32]:
+def rest_weights(template: Floats, regions: Mapping[str, Integers]) -> npt.NDArray[np.float32]:
     """How far each vertex (V,) of a neutral face (V, 3) goes to rest in pauses: all that speech moves."""
     # Fading into the upper face as regions fade elsewhere.
     return region_factors(np.asarray(template, np.float32), regions, {"upper_face": 0.0, ALL: 1.0}).astype(np.float32)

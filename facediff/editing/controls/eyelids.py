@@ -11,19 +11,15 @@ import numpy.typing as npt
 
 from facediff.errors import OptionError, damaged
 from facediff.utils.arrays import open_array
-from facediff.utils.numerics import smooth_step
+from facediff.utils.numerics import Array, Floats, Indices, Integers, smooth_step
 from facediff.utils.plain_files import load_json
 from facediff.utils.records import read_record
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Vertices = npt.NDArray[np.floating]
 
 GIVE = (
     "give {eyes}: a file that says where lids and eyeballs are (docs/animation_controls.md shows one for FLAME and for "
     "any mesh)"
 )
-STILL = 0.01  # Vertices that a blink moves by less than this share of its largest way are left alone
+STILL = 0.01  # Floats that a blink moves by less than this share of its largest way are left alone
 MEET = 0.12  # Where the lids meet, from the lower (0) to the upper edge (1): the lower lid hardly rises in a blink
 AHEAD = 0.025
 """The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
@@ -52,12 +48,12 @@ class Eyes:
         return vertices, self.closing[vertices]
 
 
-def eyes_for(template: Vertices, faces: npt.NDArray[np.integer] | None, file: Path | None) -> Eyes | None:
+def eyes_for(template: Floats, faces: Integers | None, file: Path | None) -> Eyes | None:
     """The eyes of a face (V, 3): from the file if there is one, else the puppet's if it is a puppet, else None."""
     return read_eyes(file, template) if file is not None else puppet_eyes(template, faces)
 
 
-def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Eyes | None:
+def puppet_eyes(template: Floats, faces: Integers | None) -> Eyes | None:
     """The eyes of a face (V, 3) of the built-in corpus, by the rig of its blinks; None for other faces."""
     from facediff.synthetic.known_faces import known_face
 
@@ -71,7 +67,7 @@ def puppet_eyes(template: Vertices, faces: npt.NDArray[np.integer] | None) -> Ey
     return Eyes(closing, face.eyeballs, "the built-in puppet")
 
 
-def read_eyes(path: Path, template: Vertices) -> Eyes:
+def read_eyes(path: Path, template: Floats) -> Eyes:
     """The eyes of a face (V, 3) from a file.
 
     It names shapes of shut eyes or lists the lids' edges, and lists the eyeballs::
@@ -131,8 +127,8 @@ class _EyesFile:
     brows: tuple[Any, ...] = ()
 
 
-def _read_shape(path: Path, name: str) -> Vertices:
-    """Vertices of a mesh, or displacements (V, 3) of a .npy file, that the eyes' file names."""
+def _read_shape(path: Path, name: str) -> Floats:
+    """Floats of a mesh, or displacements (V, 3) of a .npy file, that the eyes' file names."""
     from facediff.mesh import read_mesh
 
     file = path.parent / name
@@ -162,7 +158,7 @@ def _indices(path: Path, entry: object, n_vertices: int, least: int = 1) -> Indi
 
 
 def closing_of_lids(
-    template: Vertices, lids: list[tuple[Indices, Indices]], rigid: Indices | None = None
+    template: Floats, lids: list[tuple[Indices, Indices]], rigid: Indices | None = None
 ) -> npt.NDArray[np.float32]:
     """How the lids of a face (V, 3), y up and z to the viewer, shut: ways (V, 3) from the vertices of their edges.
 

@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation.animation import metres_per_unit
+from facediff.utils.numerics import Floats, Integers
 
 Fields = Mapping[str, npt.NDArray[np.float32]]
 
 
-def own_shapes(template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None) -> Fields | None:
+def own_shapes(template: Floats, faces: Integers | None) -> Fields | None:
     """Displacements (V, 3) by ARKit's names of a built-in face in metres; None for any other face."""
     from facediff.synthetic.known_faces import built_in_rig, known_face
 
@@ -23,9 +24,7 @@ def own_shapes(template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer
     return dict(zip(rig.names, rig.deltas.astype(np.float32), strict=True))
 
 
-def shapes_of(
-    template: npt.NDArray[np.floating], faces: npt.NDArray[np.integer] | None, unit: str, names: Sequence[str]
-) -> Fields:
+def shapes_of(template: Floats, faces: Integers | None, unit: str, names: Sequence[str]) -> Fields:
     """Displacements (V, 3) of a face (V, 3), in its unit, for names of ARKit's shapes."""
     fields = own_shapes(template, faces)
     if fields is not None:
@@ -41,7 +40,7 @@ def shapes_of(
 
 
 def add_shapes(
-    vertices: npt.NDArray[np.float32], fields: Fields, weights: Mapping[str, npt.NDArray[np.floating]]
+    vertices: npt.NDArray[np.float32], fields: Fields, weights: Mapping[str, Floats]
 ) -> npt.NDArray[np.float32]:
     """Vertices (T, V, 3) with each shape's displacements times its weight (T,) added."""
     for name, field in fields.items():

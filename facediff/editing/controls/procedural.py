@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import allocate_like
-from facediff.editing.controls.eyelids import Array, Eyes
+from facediff.editing.controls.eyelids import Eyes
 from facediff.mesh.flame import rotations
 from facediff.utils import ranges
-from facediff.utils.numerics import smooth_step
+from facediff.utils.numerics import Array, Floats, smooth_step
 
 PROCEDURAL = "procedural"  # Metadata key: motion added by rules
 EDITED = "edited"  # Metadata key: changes of the animation's own motion
@@ -21,7 +21,7 @@ SWAYS = "head sway"
 MOVED_HEAD = (SWAYS, "head keys", "head acting")
 """Names in the metadata of all motion of the head."""
 
-Amount = float | npt.NDArray[np.floating]
+Amount = float | Floats
 """A number, or one for each frame (T,)."""
 
 # Streams of random numbers of a seed: adding or omitting another layer does not change a layer's.
@@ -41,7 +41,7 @@ WIDENED = -0.5
 """How far an eye may be open beyond the neutral face, as a share of a closing, so that a blink still shuts it."""
 
 
-def shut_lids(animation: Animation, eyes: Eyes, curve: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+def shut_lids(animation: Animation, eyes: Eyes, curve: Floats) -> npt.NDArray[np.float32]:
     """Vertices (T, V, 3) with the eyes shut as far as a curve (T,) says, 0 to 1.
 
     The lids' own closing a and the curve's b make a + b (1 − a): at b = 0 the animation's own, at b = 1 shut, never
@@ -72,12 +72,7 @@ def blinks_over_time(frames: int, frame_rate: float, rate: Amount, seed: int) ->
 
 @ranges.checked
 def blink_curve(
-    frames: int,
-    frame_rate: float,
-    *,
-    rate: ranges.BlinkRate = RATE,
-    seed: int = 0,
-    chances: npt.NDArray[np.floating] | None = None,
+    frames: int, frame_rate: float, *, rate: ranges.BlinkRate = RATE, seed: int = 0, chances: Floats | None = None
 ) -> Array:
     """How far the eyes are shut in every frame (T,), 0 to 1, at a number of blinks a minute.
 
@@ -128,7 +123,7 @@ LIDS_PER_DEGREE = 0.012
 """How far the lids close with each degree that the eyes look down, as a share of a full closing (up: they open)."""
 
 
-def turn_eyes(animation: Animation, eyes: Eyes, angles: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+def turn_eyes(animation: Animation, eyes: Eyes, angles: Floats) -> npt.NDArray[np.float32]:
     """Vertices (T, V, 3) with eyeballs that are turned by angles (T, 2), and lids that follow them."""
     turns = gaze_rotations(angles)
     vertices = copied(animation.vertices)
@@ -183,7 +178,7 @@ def gaze_curve(frames: int, frame_rate: float, *, degrees: Amount = DEGREES_GAZE
     return np.asarray(share * curve)
 
 
-def gaze_rotations(angles: npt.NDArray[np.floating]) -> Array:
+def gaze_rotations(angles: Floats) -> Array:
     """Rotations (T, 3, 3) that turn z to the left by the first and up by the second of the angles (T, 2) in degrees."""
     left, up = np.deg2rad(np.asarray(angles, np.float64)).T
     cos, sin, one, zero = np.cos, np.sin, np.ones_like(left), np.zeros_like(left)
@@ -192,7 +187,7 @@ def gaze_rotations(angles: npt.NDArray[np.floating]) -> Array:
     return np.asarray(np.moveaxis(sideways, 2, 0) @ np.moveaxis(upwards, 2, 0))
 
 
-def sphere_centre(points: npt.NDArray[np.floating]) -> Array:
+def sphere_centre(points: Floats) -> Array:
     """Centre (3,) of the sphere nearest to points (N, 3), which may be a part of it only, by linear least squares."""
     # |x − c|² = r² is linear in c and r² − |c|²: 2 x·c + (r² − |c|²) = |x|².
     middle = np.asarray(points, np.float64).mean(axis=0)
@@ -231,7 +226,7 @@ def move_head(animation: Animation, turns: Array, shifts: Array) -> Animation:
     return replace(animation, vertices=vertices, head=np.concatenate([turns, shift], axis=1))
 
 
-def neck(template: npt.NDArray[np.floating]) -> Array:
+def neck(template: Floats) -> Array:
     """Where a head (V, 3) turns: low in its middle, and well behind the face, also where the mesh has no back."""
     low, high = template.min(axis=0), template.max(axis=0)
     height = high[1] - low[1]

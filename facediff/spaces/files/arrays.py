@@ -21,6 +21,7 @@ from facediff.utils.files import atomic
 from facediff.utils.hdf5 import HDF5_SUFFIXES, read_frames
 from facediff.utils.hints import check_number
 from facediff.utils.limits import FRAME_RATES
+from facediff.utils.numerics import Floats
 
 RELEASE = "flame_3dmead_release"
 RELEASE_WIDTHS = {"shape": 300, "exp": 100, "global_pose": 3, "jaw": 3}
@@ -196,7 +197,7 @@ def write_array(path: Path, clip: ParameterClip, layout: str = "") -> None:
             leading = np.broadcast_to(person, (len(clip.values), entry.identity))
             np.save(stream, np.concatenate([leading, clip.values], axis=1), allow_pickle=False)
             return
-        content: dict[str, npt.NDArray[np.floating]] = {"fps": np.array(clip.frame_rate)}
+        content: dict[str, Floats] = {"fps": np.array(clip.frame_rate)}
         if entry.identity_array and clip.identity is not None:
             content[entry.identity_array] = clip.identity
         first = 0

@@ -14,9 +14,9 @@ from facediff.spaces.operations import at_times
 from facediff.spaces.space import Space
 from facediff.utils.hints import check_number
 from facediff.utils.limits import FRAME_RATES
+from facediff.utils.numerics import Array, Floats
 
 Values = npt.NDArray[np.float32]
-Array = npt.NDArray[np.float64]
 
 MOST_MISSING = 3600
 """Frames that may be missing between two rows, a minute at 60 a second; they are interpolated."""
@@ -74,7 +74,7 @@ def even(clip: ParameterClip) -> ParameterClip:
     return replace(clip, values=values.astype(np.float32), times=None)
 
 
-def checked(path: Path, values: npt.NDArray[np.floating], frame_rate: float) -> Values:
+def checked(path: Path, values: Floats, frame_rate: float) -> Values:
     """Values of a file (T, C) as float32, finite."""
     check_number(path, "frame rate", frame_rate, *FRAME_RATES)
     sound = (np.abs(values) <= LARGEST).all(axis=1)

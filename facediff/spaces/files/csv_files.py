@@ -8,18 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, damaged, note
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
-from facediff.spaces.files.clips import Array, ParameterClip, checked, columns_of, refuse_gaps, shortest
+from facediff.spaces.files.clips import ParameterClip, checked, columns_of, refuse_gaps, shortest
 from facediff.spaces.layouts import layout
 from facediff.spaces.operations import permuted
 from facediff.utils.files import atomic
 from facediff.utils.limits import quoted
+from facediff.utils.numerics import Array, Floats
 from facediff.utils.plain_files import read_columns, write_table
 
-Values = npt.NDArray[np.floating]
+Values = Floats
 
 DAY = 24 * 3600
 TIMECODE, COUNT = "Timecode", "BlendShapeCount"
