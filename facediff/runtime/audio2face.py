@@ -44,16 +44,12 @@ AT_ONCE = 32
 
 
 class Audio2Face:
-    """A model folder, ready to run.
-
-    Args:
-        folder: its content.
-        session: its network.
+    """A model folder with its network, ready to run.
 
     Example:
         >>> model = Audio2Face.open("Audio2Face-3D-v2.3-Mark")  # doctest: +SKIP
-        >>> face = model.animate(model.infer(speech, 30, {"joy": 0.7}), 30)  # doctest: +SKIP
-        >>> face["skin_vertices"].shape  # doctest: +SKIP
+        >>> result = model.infer(speech, 30, {"joy": 0.7})  # doctest: +SKIP
+        >>> FaceAnimator(model.folder, 30).animate(result)["skin_vertices"].shape  # doctest: +SKIP
         (69, 61520, 3)
     """
 
@@ -79,12 +75,7 @@ class Audio2Face:
 
     @classmethod
     def open(cls, folder: str | Path, *, threads: int = 0) -> Audio2Face:
-        """Read a folder.
-
-        Args:
-            folder: as NVIDIA distributes it.
-            threads: of the processor; as many as it has cores if 0.
-        """
+        """Read a folder as NVIDIA distributes it; ``threads`` of 0 are as many as the processor has cores."""
         content = read_audio2face(Path(folder))
         return cls(content, open_session(content.network, threads=threads))
 
@@ -115,7 +106,7 @@ class Audio2Face:
         self,
         audio: Array,
         frame_rate: float,
-        emotion: Mapping[str, float] | Array | None = None,
+        emotion: Mapping[str, float] | None = None,
         *,
         start: int = 0,
         frames: int | None = None,
@@ -126,7 +117,7 @@ class Audio2Face:
         Args:
             audio: speech (S,) at 16 kHz, full scale 1, not normalised.
             frame_rate: frames a second.
-            emotion: strengths by name, or the explicit emotion of every frame (T, E).
+            emotion: strengths by name.
             start: the first frame.
             frames: how many; all with moments in the speech if None.
             origin: the sample of the recording that ``audio`` begins with, where it is the rest of a longer one.
@@ -136,14 +127,7 @@ class Audio2Face:
         """
         facts = self.folder.facts
         count = self.frames(len(audio), frame_rate) - start if frames is None else frames
-        if isinstance(emotion, np.ndarray):
-            implicit = np.broadcast_to(self.folder.implicit, (len(emotion), facts.implicit))
-            emotions = np.concatenate([implicit, emotion.astype(np.float32)], 1)[:count]
-        else:
-            emotions = np.broadcast_to(self.emotion(emotion), (count, facts.implicit + len(facts.emotions)))
-        if emotions.shape != (count, facts.implicit + len(facts.emotions)):
-            shape = (len(emotions), emotions.shape[1] - facts.implicit)
-            raise FaceDiffError(f"emotion: has the shape {shape}; expected ({count}, {len(facts.emotions)})")
+        emotions = self.emotion(emotion)
         moments = [self.moment(start + frame, frame_rate) - origin for frame in range(count)]
         after = max(0, max(moments, default=0) + facts.buffer - facts.before - len(audio))
         padded = np.pad(audio.astype(np.float32), (facts.before, after))
@@ -152,7 +136,7 @@ class Audio2Face:
         for first in range(0, count, self._batch):
             rows = slice(first, min(first + self._batch, count))
             windows = np.stack([padded[at : at + facts.buffer] for at in moments[rows]])[:, None]
-            inputs = {"input": windows, "emotion": np.ascontiguousarray(emotions[rows][:, None])}
+            inputs = {"input": windows, "emotion": np.tile(emotions, (len(windows), 1, 1))}
             result = run_session(self._session, inputs, str(self.folder.network))[self._result]
             if result.size != len(windows) * facts.size or result.dtype != np.float32 or not np.isfinite(result).all():
                 raise FaceDiffError(
@@ -162,35 +146,15 @@ class Audio2Face:
             results[rows] = result.reshape(len(windows), facts.size)
         return results
 
-    def animate(self, result: Array, frame_rate: float, *, blink: float = 0.0) -> dict[str, Array]:
-        """The face of every frame; see :class:`FaceAnimator`.
-
-        Args:
-            result: (T, n) of :meth:`infer`.
-            frame_rate: frames a second.
-            blink: how far the lids are closed besides.
-
-        Returns:
-            ``skin_vertices`` (T, V, 3), ``tongue_vertices`` (T, U, 3), ``jaw_transform`` (T, 4, 4) for column vectors,
-            and ``eyes_rotation`` (T, 4): the angles x and y of the right eye, then of the left one.
-        """
-        animator = FaceAnimator(self.folder, frame_rate, blink=blink)
-        return animator.animate(result)
-
 
 class FaceAnimator:
     """Makes a face of the network's results, frame after frame; it remembers the state of the smoothing.
-
-    Args:
-        folder: content of the model's folder.
-        frame_rate: frames a second.
-        blink: how far the lids are closed besides.
 
     Attributes:
         lower: (V, 1) how far each vertex belongs to the lower face.
     """
 
-    def __init__(self, folder: Audio2FaceFolder, frame_rate: float, *, blink: float = 0.0) -> None:
+    def __init__(self, folder: Audio2FaceFolder, frame_rate: float) -> None:
         self.folder, self.frame_rate = folder, float(frame_rate)
         arrays, settings = folder.arrays, folder.settings
         height = arrays["skin"][:, 1].astype(np.float64)
@@ -202,8 +166,8 @@ class FaceAnimator:
             (self.lower * settings.lower_face_strength, self._share(settings.lower_face_smoothing)),
             ((1 - self.lower) * settings.upper_face_strength, self._share(settings.upper_face_smoothing)),
         )
-        closing = -settings.eyelid_open_offset + blink * settings.blink_strength
-        self._offset = arrays["eye_close"] * closing + arrays["lip_open"] * np.float64(settings.lip_open_offset)
+        lids, lips = np.float64(-settings.eyelid_open_offset), np.float64(settings.lip_open_offset)
+        self._offset = arrays["eye_close"] * lids + arrays["lip_open"] * lips
         self._filters: list[list[Array64]] = []
         self._frame = 0
 
@@ -212,10 +176,13 @@ class FaceAnimator:
         return 1 - 0.5 ** (1 / self.frame_rate / smoothing) if smoothing > 0 else 1.0
 
     def animate(self, result: Array) -> dict[str, Array]:
-        """The next frames; see :meth:`Audio2Face.animate`."""
+        """The next frames, of results (T, n) of the network.
+
+        Returns:
+            ``skin_vertices`` (T, V, 3), ``tongue_vertices`` (T, U, 3), ``jaw_transform`` (T, 4, 4) for column vectors,
+            and ``eyes_rotation`` (T, 4): the angles x and y of the right eye, then of the left one.
+        """
         facts, count = self.folder.facts, len(result)
-        if result.ndim != 2 or result.shape[1] != facts.size or not np.isfinite(result).all():
-            raise FaceDiffError(f"result: has the shape {result.shape}; expected finite numbers (frames, {facts.size})")
         skin, tongue, jaw, eyes = np.split(result, np.cumsum([facts.skin, facts.tongue, facts.jaw]), axis=1)
         vertices = np.empty((count, facts.skin_vertices, 3), np.float32)
         for frame, coefficients in enumerate(skin):
@@ -257,24 +224,18 @@ class FaceAnimator:
         return rigid_transform(rest, rest + offsets * settings.lower_teeth_strength + shift).astype(np.float32)
 
     def _eyes(self, angles: Array) -> Array:
-        settings, saccades = self.folder.settings, self.folder.arrays["saccades"]
+        settings, saccades = vars(self.folder.settings), self.folder.arrays["saccades"]
         # In exact arithmetic: NVIDIA adds up a clock in single precision, which at 25 frames a second is late by a row
         # wherever a moment of the saccades meets a frame.
         clock = step(self.frame_rate) * SACCADE_RATE / SAMPLE_RATE
-        seed = Fraction(settings.eye_saccade_seed)
+        seed = Fraction(settings["eye_saccade_seed"])
         rows = [
             math.floor(seed + frame * clock) % len(saccades) for frame in range(self._frame, self._frame + len(angles))
         ]
-        saccade_angles = np.tile(saccades[rows], (1, 2)) * np.float64(settings.saccade_strength)
-        offsets = np.array(
-            [
-                settings.right_eye_rot_x_offset,
-                settings.right_eye_rot_y_offset,
-                settings.left_eye_rot_x_offset,
-                settings.left_eye_rot_y_offset,
-            ]
-        )
-        return np.asarray(offsets + settings.eyeballs_strength * angles.astype(np.float64) + saccade_angles, np.float32)
+        saccade_angles = np.tile(saccades[rows], (1, 2)) * np.float64(settings["saccade_strength"])
+        offsets = np.array([settings[f"{side}_eye_rot_{axis}_offset"] for side in ("right", "left") for axis in "xy"])
+        moved = settings["eyeballs_strength"] * angles.astype(np.float64)
+        return np.asarray(offsets + moved + saccade_angles, np.float32)
 
 
 def rigid_transform(rest: Array64, moved: Array64) -> Array64:

@@ -30,35 +30,20 @@ LONGEST_BUFFER = 160_000
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """What ``network_info.json`` says.
-
-    Attributes:
-        actor: name of the actor.
-        implicit: numbers of the implicit emotion.
-        emotions: names of the explicit emotions.
-        default_emotion: their default strengths.
-        skin: coefficients of the skin.
-        tongue: coefficients of the tongue.
-        jaw: numbers of the jaw, three for each point.
-        eyes: numbers of the eyes: x and y of the right one, then of the left one.
-        skin_vertices: vertices of the skin.
-        tongue_vertices: vertices of the tongue.
-        buffer: samples of a window.
-        before: samples of a window before its frame's moment.
-    """
+    """What ``network_info.json`` says: numbers of coefficients, vertices and samples."""
 
     actor: str
-    implicit: int
-    emotions: tuple[str, ...]
+    implicit: int  # numbers of the implicit emotion
+    emotions: tuple[str, ...]  # names of the explicit ones
     default_emotion: tuple[float, ...]
     skin: int
     tongue: int
-    jaw: int
-    eyes: int
+    jaw: int  # three for each point
+    eyes: int  # x and y of the right one, then of the left one
     skin_vertices: int
     tongue_vertices: int
-    buffer: int
-    before: int
+    buffer: int  # samples of a window
+    before: int  # of these, before its frame's moment
 
     @property
     def size(self) -> int:
@@ -70,31 +55,8 @@ class NetworkFacts:
 class AnimatorSettings:
     """How coefficients become a face, as ``config`` of the model's settings says; lengths in the face's unit.
 
-    Attributes:
-        input_strength: factor of the sound.
-        lower_face_smoothing: seconds in which half of a change of the lower face is followed, by each of two filters.
-        upper_face_smoothing: the same of the upper face.
-        lower_face_strength: factor of the lower face's motion.
-        upper_face_strength: factor of the upper face's motion.
-        face_mask_level: height of the border between both, as a share of the face's height.
-        face_mask_softness: how wide that border is.
-        skin_strength: factor of all motion of the skin.
-        blink_strength: factor of blinks that are added from outside.
-        eyelid_open_offset: how far the lids are opened, in shares of closing.
-        lip_open_offset: how far the lips are opened.
-        tongue_strength: factor of the tongue's motion.
-        tongue_height_offset: added to the tongue's y.
-        tongue_depth_offset: added to the tongue's z.
-        lower_teeth_strength: factor of the jaw's motion.
-        lower_teeth_height_offset: added to the jaw's y.
-        lower_teeth_depth_offset: added to the jaw's z.
-        eyeballs_strength: factor of the eyes' motion.
-        saccade_strength: factor of the stored saccades.
-        right_eye_rot_x_offset: added to the right eye's first angle.
-        right_eye_rot_y_offset: added to its second angle.
-        left_eye_rot_x_offset: added to the left eye's first angle.
-        left_eye_rot_y_offset: added to its second angle.
-        eye_saccade_seed: the first row of the stored saccades.
+    Smoothing is the seconds in which each of two filters follows half of a change; strengths are factors of motion. The
+    border between the lower and the upper face is at a share (``level``) of the face's height.
     """
 
     input_strength: float = 1.0
@@ -105,8 +67,7 @@ class AnimatorSettings:
     face_mask_level: float = 0.6
     face_mask_softness: float = 0.0085
     skin_strength: float = 1.0
-    blink_strength: float = 1.0
-    eyelid_open_offset: float = 0.0
+    eyelid_open_offset: float = 0.0  # in shares of closing
     lip_open_offset: float = 0.0
     tongue_strength: float = 1.0
     tongue_height_offset: float = 0.0
@@ -120,24 +81,14 @@ class AnimatorSettings:
     right_eye_rot_y_offset: float = 0.0
     left_eye_rot_x_offset: float = 0.0
     left_eye_rot_y_offset: float = 0.0
-    eye_saccade_seed: float = 0.0
+    eye_saccade_seed: float = 0.0  # the first row of the stored saccades
 
 
 @dataclass(frozen=True)
 class SolverSettings:
     """``blendshape_params`` of a solver; the lists have a value for each pose.
 
-    Attributes:
-        l1: strength of the term that keeps the sum of the weights small.
-        l2: strength of the term that keeps each weight small.
-        temporal: strength of the term that keeps weights near the previous frame's.
-        symmetry: strength of the term that keeps the weights of a symmetric pair alike.
-        active: whether a pose is used.
-        cancel: poses with the same number, not negative, exclude one another.
-        symmetric: poses with the same number are a left one and a right one.
-        multipliers: factor of each weight that was solved for.
-        offsets: added to it then.
-        template_size: diagonal of the face for which the strengths are stated.
+    Poses with the same number, not negative, exclude one another (``cancel``), or are a left one and a right one.
     """
 
     l1: float
@@ -149,48 +100,30 @@ class SolverSettings:
     symmetric: tuple[int, ...]
     multipliers: tuple[float, ...]
     offsets: tuple[float, ...]
-    template_size: float = 54.7
+    template_size: float = 54.7  # diagonal of the face for which the strengths are stated
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Blendshapes of the skin or of the tongue with the settings of their solver.
-
-    Attributes:
-        names: K names.
-        neutral: (V, 3) the face at rest.
-        deltas: (K, V, 3) displacement at a weight of 1.
-        mask: vertices that are compared; all if empty.
-        settings: of the solver.
-    """
+    """Blendshapes of the skin or of the tongue with the settings of their solver."""
 
     names: tuple[str, ...]
-    neutral: Array
-    deltas: Array
-    mask: npt.NDArray[np.int64]
+    neutral: Array  # (V, 3)
+    deltas: Array  # (K, V, 3)
+    mask: npt.NDArray[np.int64]  # vertices that are compared; all if empty
     settings: SolverSettings
 
 
 @dataclass(frozen=True)
 class Audio2FaceFolder:
-    """All that a folder holds but its network.
-
-    Attributes:
-        network: the graph's file.
-        facts: sizes and names.
-        settings: of the animator.
-        implicit: (I,) the implicit emotion of the chosen shot and frame.
-        arrays: ``skin_shapes`` (skin, V, 3), ``skin`` (V, 3) at rest, ``lip_open`` and ``eye_close`` (V, 3),
-            ``tongue_shapes``, ``tongue``, ``jaw`` (points, 3) at rest, ``saccades`` (rows, 2).
-        poses: blendshapes by ``skin`` and ``tongue``; empty where the folder has none.
-    """
+    """All that a folder holds but its network."""
 
     network: Path
     facts: NetworkFacts
     settings: AnimatorSettings
-    implicit: Array
-    arrays: Mapping[str, Array]
-    poses: Mapping[str, Poses]
+    implicit: Array  # (I,) emotion of the chosen shot and frame
+    arrays: Mapping[str, Array]  # as read_geometry gives them
+    poses: Mapping[str, Poses]  # by skin and tongue, where the folder has them
 
 
 def read_audio2face(folder: Path) -> Audio2FaceFolder:

@@ -28,7 +28,6 @@ CONFIG: dict[str, Any] = {
     "source_shot": "calm",
     "source_frame": 1,
     "skin_strength": 1.1,
-    "blink_strength": 1.0,
     "lower_teeth_strength": 1.2,
     "lower_teeth_height_offset": -0.1,
     "lower_teeth_depth_offset": 0.25,

@@ -18,6 +18,7 @@ import facediff
 from facediff.cli.app import main
 from facediff.errors import FaceDiffError
 from facediff.pipelines.animator import Audio2FaceAnimator
+from facediff.runtime.audio2face import FaceAnimator
 from tests.fakes.audio2face import POSES, TONGUE_POSES, VERTICES, write_audio2face
 
 SPEECH = (np.random.default_rng(1).normal(size=20_000) * 0.1).astype(np.float32)
@@ -74,14 +75,15 @@ def test_solve_is_nvidias_with_the_folders_settings(
     content: dict[str, Any],
     part: Any,  # noqa: ANN401
 ) -> None:
-    vertices = model.model.animate(model.model.infer(SPEECH, 30), 30)[f"{part}_vertices"]
+    animator = FaceAnimator(model.model.folder, 30)
+    vertices = animator.animate(model.model.infer(SPEECH, 30))[f"{part}_vertices"]
     np.testing.assert_allclose(model.solve(part, vertices), solved(content, part, vertices), atol=1e-6)
 
 
 def test_animate_gives_vertices_and_what_they_are_made_of(model: Audio2FaceAnimator) -> None:
     animation = model.animate((SPEECH, 16_000), style="joy:0.7,pain:0.2")
     result = model.model.infer(SPEECH, 30, {"joy": 0.7, "pain": 0.2})
-    animated = model.model.animate(result, 30)
+    animated = FaceAnimator(model.model.folder, 30).animate(result)
     np.testing.assert_allclose(animation.vertices, animated["skin_vertices"], atol=1e-5)
     assert animation.vertices.shape == (FRAMES, VERTICES, 3)
     assert (animation.frame_rate, animation.unit) == (30.0, "cm")
