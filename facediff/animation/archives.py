@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -17,9 +17,9 @@ from facediff.errors import FaceDiffError, OptionError, check_known, located
 from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays, write_header
 from facediff.utils.files import atomic
-from facediff.utils.hints import check_number
-from facediff.utils.limits import FRAME_RATES, SAMPLE_RATES, check_format, quoted
+from facediff.utils.limits import check_format
 from facediff.utils.plain_files import json_text, parse_json
+from facediff.utils.records import read_record
 
 FORMAT = "facediff take 1"
 """Marks an archive. The word is older than the class :class:`Animation`; it stays, so that old and new files agree."""
@@ -45,6 +45,18 @@ OF_ARCHIVE = re.compile(f"about|region_.*|{'|'.join(ARRAYS)}")
 
 OF_TOPOLOGY = ("template", "faces", "colours", "inner_lip_pairs")
 """Facts that hold for one topology only, as regions do."""
+
+
+@dataclass(frozen=True)
+class About:
+    """The facts of an archive that are no arrays: its entry ``about``."""
+
+    name: str
+    frame_rate: float
+    unit: str
+    sample_rate: int
+    metadata: Mapping[str, str]
+    space: Any = None
 
 
 class AnimationFacts(TypedDict, total=False):
@@ -155,7 +167,11 @@ def read_archive(path: Path) -> Animation:
     absent_entries = [name for name in ("vertices", "template", "about") if name not in arrays]
     if absent_entries:
         raise FaceDiffError(f"{path}: has no {', '.join(absent_entries)}; {expected}")
-    facts = _about(arrays.pop("about"), f"{path}: its entry about")
+    source, remedy = f"{path}: its entry about", "write the file again"
+    about = parse_json(str(arrays.pop("about")), source, remedy=remedy)
+    if isinstance(about, dict):
+        check_format(source, about.get("format"), FORMAT)
+    facts = dict(vars(read_record(About, about, source, remedy=remedy, strict=False)))
     count = len(np.atleast_1d(arrays["template"]))
     checked = {name: _checked(path, name, array, count) for name, array in arrays.items()}
     regions = {name.removeprefix("region_"): array for name, array in checked.items() if name.startswith("region_")}
@@ -177,30 +193,9 @@ class _Entries:
         return isinstance(name, str) and OF_ARCHIVE.fullmatch(name) is not None
 
 
-def _about(array: npt.NDArray[Any], source: str) -> dict[str, Any]:
-    """The facts of an archive that are no arrays."""
-    remedy = "write the file again"
-    about = parse_json(str(array), source, remedy=remedy)
-    if not isinstance(about, dict):
-        raise FaceDiffError(f"{source} is {quoted(about)}; expected an object; {remedy}")
-    check_format(source, about.get("format"), FORMAT)
-    metadata = about.get("metadata")
-    texts = [about.get("name"), about.get("unit"), *(metadata.values() if isinstance(metadata, dict) else [None])]
-    if not all(isinstance(text, str) for text in texts):
-        raise FaceDiffError(f"{source} lacks its name, its unit or its metadata, which are texts; {remedy}")
-    numbers = {
-        "frame_rate": check_number(source, "frame_rate", about.get("frame_rate"), *FRAME_RATES, remedy=remedy),
-        "sample_rate": int(
-            check_number(source, "sample_rate", about.get("sample_rate"), *SAMPLE_RATES, whole=True, remedy=remedy)
-        ),
-    }
-    return {"name": about["name"], "unit": about["unit"], "metadata": metadata, "space": about.get("space"), **numbers}
-
-
 def _checked(path: Path, name: str, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """One array of an archive in the type that :class:`Animation` has; indices name one of ``count`` vertices."""
     kinds, expectation, lengths, number_type = ARRAYS.get(name, REGION)
-    remedy = "write the file again"
     fits = array.ndim == len(lengths) and all(
         length in (None, size) for size, length in zip(array.shape, lengths, strict=True)
     )
@@ -210,7 +205,7 @@ def _checked(path: Path, name: str, array: npt.NDArray[Any], count: int) -> npt.
     fits = fits and array.dtype.kind in kinds and (kinds == "f" or 0 <= array.min() <= array.max() <= last)
     if not fits:
         raise FaceDiffError(
-            f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {expectation}; {remedy}"
+            f"{path}: its {name} are {array.dtype} of shape {array.shape}; expected {expectation}; write the file again"
         )
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
         return array.astype(number_type, copy=False)

@@ -8,11 +8,11 @@ where its loop starts from more than noise, ``style.onnx`` of one that takes sty
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -21,12 +21,13 @@ from facediff.errors import FaceDiffError, damaged
 from facediff.runtime.graph_check import REMEDY
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.decoding import ChannelDecoder
-from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.speech.windows import FrameClock, Rule, WindowPlan
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
 from facediff.utils.limits import quoted
 from facediff.utils.plain_files import load_json
+from facediff.utils.ranges import Range
+from facediff.utils.records import read_record
 
 FORMAT = "facediff model"
 VERSION = 1
@@ -45,90 +46,50 @@ EXPECTED = "expected a folder that `facediff export-model` wrote"
 
 @dataclass(frozen=True)
 class Description:
-    """Content of ``model.json``.
+    """Content of ``model.json``. Folders of earlier versions lack later entries, which have defaults."""
 
-    Attributes:
-        model: class of the model.
-        facediff: version that wrote the folder.
-        corpus: that the model was trained on.
-        synthetic: whether that corpus is synthetic.
-        licences: licence labels by subject: data, weights …
-        opset: of the graphs.
-        precision: how weights are stored: ``float32``, ``float16`` or ``int8``.
-        sizes: bytes of each file.
-        graphs: inputs and outputs of each graph: name, type and shape, with names for what may be of any length.
-        sample_rate: of the speech, in Hz.
-        frame_rate: of the motion.
-        unit: of length.
-        identities: training identities, in the order of the identity index.
-        faces: identities with a neutral face, in the order of the array ``templates``.
-        styles: names of the style vectors, in the order of the array ``styles``; a name of an identity is its default.
-        windows: how long speech is cut, as :class:`~facediff.speech.windows.WindowPlan` takes it.
-        epsilon: added to the variance of speech before it is standardised.
-        equal_lengths: whether all clips of a batch must be of one length; reference motions of one always must.
-        state: numbers in a frame of noisy motion.
-        kept: numbers in a frame by which windows of long speech are blended.
-        sampler: its name.
-        steps: the diffusion steps visited.
-        table: for each of them the factors of the noisy motion, of the last three predictions (latest first) and noise;
-            where there is a sixth, of the first prediction.
-        last_step: the step at which only the mean is left.
-        decoded: input of the last graph: the ``sample``, or the ``kept`` numbers of the last step.
-        generation: ``sampled``, by a loop over ``step``; or ``direct``, by ``motion`` alone. In a direct model, what is
-            said of the loop is 0, empty, and ``last_step`` −1, as in a model that predicts no mean.
-        blending: where windows go over into one another: in all ``steps`` of the loop, or in the ``motion``.
-        clock: how the model counts frames, as :class:`~facediff.speech.windows.FrameClock` takes it.
-        style_source: origin of styles: a ``reference`` motion; a training ``identity``; ``none`` if there are none.
-        longest: frames at most that are animated in one pass; 0 for any number.
-        drawn: numbers in a frame of the noise that the loop starts from; ``state`` if 0.
-        noise_of: what noise depends on: the ``clip`` and the seed, or the ``seed``.
-        stillness: how far the stored references move; reference motion is rejected as another face if its static
-            vertices (the array ``still``) deviate by more than a fraction of this.
-        quick_steps: the diffusion steps visited at low latency; none where the model does not change its steps.
-        quick_table: for each of them, as in ``table``.
-        voice_gate: the default voice gate: ``energy``, or ``off`` for imported models.
-        space: meaning of the motion's numbers, as :meth:`facediff.spaces.Space.state` says it; empty for vertices.
-        check: the comparison with PyTorch when the folder was written.
-    """
-
-    model: str
-    facediff: str
-    corpus: str
-    synthetic: bool
-    licences: dict[str, str]
-    opset: int
-    precision: str
-    sizes: dict[str, int]
-    graphs: dict[str, dict[str, list[dict[str, Any]]]]
-    sample_rate: int
-    frame_rate: float
-    unit: str
-    identities: list[str]
-    faces: list[str]
-    styles: list[str]
-    windows: dict[str, float]
-    epsilon: float
-    equal_lengths: bool
-    state: int
-    kept: int
-    sampler: str
-    steps: list[int]
-    table: list[list[float]]
-    last_step: int
-    decoded: str
-    generation: str = "sampled"
-    blending: str = "steps"
-    clock: dict[str, Any] = field(default_factory=lambda: {"rule": "rounded"})
-    style_source: str = "reference"
-    longest: int = 0
-    drawn: int = 0
-    noise_of: str = "clip"
+    model: str  # class of the model
+    facediff: str  # version that wrote the folder
+    corpus: str  # that the model was trained on
+    synthetic: bool  # whether that corpus is synthetic
+    licences: dict[str, str]  # labels by subject: data, weights …
+    opset: int  # of the graphs
+    precision: str  # how weights are stored: float32, float16 or int8
+    sizes: dict[str, int]  # bytes of each file
+    graphs: dict[str, dict[str, list[dict[str, Any]]]]  # inputs and outputs: name, type, shape; names for open lengths
+    sample_rate: Literal[16_000]  # of the speech, in Hz
+    frame_rate: Annotated[float, Range(1, 1000)]  # of the motion
+    unit: str  # of length
+    identities: Sequence[str]  # training identities, in the order of the identity index
+    faces: Sequence[str]  # identities with a neutral face, in the order of the array templates
+    styles: Sequence[str]  # names of the array styles; a name of an identity is its default
+    windows: dict[str, float]  # how long speech is cut, as WindowPlan takes it
+    epsilon: Annotated[float, Range(0, 1, above=True, below=True)]  # added to the variance of speech
+    equal_lengths: bool  # whether all clips of a batch must be of one length; reference motions of one always must
+    state: int  # numbers in a frame of noisy motion
+    kept: int  # numbers in a frame by which windows of long speech are blended
+    sampler: str  # its name
+    steps: Sequence[int]  # the diffusion steps visited
+    # For each of them the factors of the noisy motion, of the last three predictions (latest first) and noise; where
+    # there is a sixth, of the first prediction.
+    table: Sequence[Sequence[float]]
+    last_step: int  # the step at which only the mean is left; -1 in a model that predicts no mean
+    decoded: Literal["sample", "kept"]  # input of the last graph: the sample, or the kept numbers of the last step
+    generation: Literal["sampled", "direct"] = "sampled"  # by a loop over the graph step, or by motion alone
+    blending: Literal["steps", "motion"] = "steps"  # where windows go over into one another
+    clock: dict[str, Any] = field(default_factory=lambda: {"rule": "rounded"})  # as FrameClock takes it
+    style_source: Literal["reference", "identity", "none"] = "reference"  # motion, or a training identity
+    longest: int = 0  # frames at most that are animated in one pass; 0 for any number
+    drawn: int = 0  # numbers in a frame of the noise that the loop starts from; state if 0
+    noise_of: Literal["clip", "seed"] = "clip"  # what noise depends on, the seed besides
+    # How far the stored references move; reference motion is rejected as another face if its static vertices (the array
+    # still) deviate by more than a fraction of this.
     stillness: float = 0.0
-    quick_steps: list[int] = field(default_factory=list)
-    quick_table: list[list[float]] = field(default_factory=list)
-    voice_gate: str = USUAL_GATE
-    space: dict[str, Any] = field(default_factory=dict)
-    check: dict[str, Any] = field(default_factory=dict)
+    quick_steps: Sequence[int] = ()  # visited at low latency; none where the model does not change its steps
+    quick_table: Sequence[Sequence[float]] = ()
+    voice_gate: Literal["energy", "off"] = "energy"  # the default; off for imported models
+    space: dict[str, Any] = field(default_factory=dict)  # of the motion, as Space.state says it; empty for vertices
+    check: dict[str, Any] = field(default_factory=dict)  # the comparison with PyTorch when the folder was written
 
     def content(self) -> dict[str, Any]:
         """The JSON object that is written."""
@@ -158,29 +119,14 @@ class Description:
         return FrameClock(self.frame_rate, **facts)
 
 
-KINDS: dict[str, type | tuple[type, ...]] = {
-    "str": str,
-    "bool": bool,
-    "int": int,
-    "float": (int, float),
-    "list": list,
-    "dict": dict,
-}
-
-
 def read_folder(folder: Path) -> tuple[Description, Arrays]:
     """Description and arrays of an exported model; its graphs are checked where they are opened."""
     path = folder / DESCRIPTION
     content = load_json(path, remedy=EXPECTED)
     if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
         raise FaceDiffError(f"{path}: is not version {VERSION} of a model's description; {EXPECTED}")
+    description = read_record(Description, content, path, remedy=REMEDY, strict=False)
     with damaged(path, REMEDY):
-        # Folders of earlier versions lack later entries, which have defaults.
-        names = {entry.name: KINDS[str(entry.type).split("[")[0]] for entry in fields(Description)}
-        for name in names.keys() & content.keys():
-            if not isinstance(content[name], names[name]):
-                raise TypeError(f"{name} is {quoted(content[name])}")
-        description = Description(**{name: content[name] for name in names if name in content})
         _check(description)
     for name in (*(f"{graph}.onnx" for graph in description.graphs), ARRAYS):
         size = (folder / name).stat().st_size if (folder / name).is_file() else None
@@ -197,24 +143,13 @@ def read_folder(folder: Path) -> tuple[Description, Arrays]:
 
 def _check(description: Description) -> None:
     """Refuse what would be taken for something else, or would leave the folder."""
-    allowed: dict[str, tuple[object, ...]] = {
-        "sample_rate": (16_000,),
-        "generation": tuple(NEEDED),
-        "blending": ("steps", "motion"),
-        "style_source": ("reference", "identity", "none"),
-        "noise_of": ("clip", "seed"),
-        "voice_gate": (USUAL_GATE, OFF),
-        "decoded": ("sample", "kept"),
-    }
-    stated = {name: getattr(description, name) for name in allowed} | {"clock": description.frame_clock.rule}
-    for name, values in (allowed | {"clock": get_args(Rule)}).items():
-        if stated[name] not in values:
-            raise ValueError(f"{name} is {quoted(stated[name])}; expected {' or '.join(map(str, values))}")
+    if (rule := description.frame_clock.rule) not in get_args(Rule):
+        raise ValueError(f"clock is {quoted(rule)}; expected {' or '.join(get_args(Rule))}")
     needed, optional = NEEDED[description.generation], OPTIONAL[description.generation]
     if not {*needed} <= {*description.graphs} <= {*needed, *optional}:
         raise ValueError(f"graphs are {', '.join(description.graphs)}; expected {', '.join(needed)}")
-    if not (1 <= description.frame_rate <= 1000 and 0 < description.epsilon < 1 and description.faces):
-        raise ValueError("frame_rate, epsilon or faces is out of range")
+    if not description.faces:
+        raise ValueError("faces is empty")
     for steps, table in (("steps", "table"), ("quick_steps", "quick_table")):
         rows = [np.asarray(row, np.float64) for row in getattr(description, table)]
         fits = all(row.shape in ((5,), (6,)) and (np.abs(row) < 1e9).all() for row in rows)

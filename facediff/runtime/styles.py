@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +53,7 @@ class ExportedStyles(StyleReader[RuntimeStyle]):
         """S: how many numbers a style vector has."""
         return int(self.model.arrays["styles"].shape[1])
 
-    def names(self) -> list[str]:
+    def names(self) -> Sequence[str]:
         """Names of the folder's styles."""
         return self.about.styles
 
