@@ -296,46 +296,17 @@ class Animation:
         written: list[Path] = late(f"{MOTION}:drive")(self, avatar, path)
         return written
 
-    def blendshapes(
-        self,
-        shapes: str | Path,
-        *,
-        carry: bool = False,
-        smoothness: float = 0.02,
-        symmetry: float = 0.0,
-        sparsity: float = 0.003,
-        bounds: tuple[float, float] = (0.0, 1.0),
-        region: str | None = None,
-        residual_limit: float = 0.8,
-        only_arkit: bool = False,
-    ) -> Any:  # noqa: ANN401 - facediff.editing.blendshapes.Weights
+    def blendshapes(self, shapes: str | Path, *, carry: bool = False, only_arkit: bool = False, **options: Any) -> Any:  # noqa: ANN401 - facediff.editing.blendshapes.Weights
         """Weights of blendshapes that come nearest to the motion; their ``save`` writes a table.
 
         Args:
             shapes: folder of .obj or .ply files named jawOpen, mouthFunnel …, a .glb with named targets, or ``puppet``
                 for the built-in face's.
             carry: the shapes are of another topology: transfer them to this mesh.
-            smoothness: cost of change over time; 0 is off.
-            symmetry: cost of a difference between left and right; 0 is off.
-            sparsity: cost of weights, which keeps shapes at 0 that would cancel one another; 0 is off.
-            bounds: least and greatest weight.
-            region: look at a region of the face only, such as ``lips``.
-            residual_limit: share of the motion that weights may leave before they are refused.
             only_arkit: leave out shapes without ARKit's names.
+            options: fields of :class:`facediff.editing.blendshapes.SolveOptions`: ``smoothness``, ``region`` …
         """
-        return late(f"{MOTION}:blendshapes")(
-            self,
-            shapes,
-            carry=carry,
-            only_arkit=only_arkit,
-            smoothness=smoothness,
-            symmetry=symmetry,
-            sparsity=sparsity,
-            lower=bounds[0],
-            upper=bounds[1],
-            region=region,
-            residual_limit=residual_limit,
-        )
+        return late(f"{MOTION}:blendshapes")(self, shapes, carry=carry, only_arkit=only_arkit, **options)
 
     def _repr_html_(self) -> str | None:
         """The face, playing in a notebook; None without a mesh, for the text alone."""

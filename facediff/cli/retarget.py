@@ -239,7 +239,9 @@ def surface_notes(mesh: Path, output: Path, animation: Animation) -> list[str]:
         return []
     textured = has_textures(mesh)
     if textured and "surface" in FORMATS[output.suffix].uses:
-        return list(read_textures(mesh, len(animation.triangles)).losses)
+        losses = list(read_textures(mesh, len(animation.triangles)).losses)
+        is_usd = output.suffix.lower() != ".glb"
+        return [*losses, *([f"materials and pictures of {mesh.name} are left out; write .glb to keep them"] * is_usd)]
     if is_glb:
         glb = open_glb(mesh)
         if not glb.entries("materials"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import struct
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions, Up
 from facediff.errors import FaceDiffError
-from facediff.mesh.textures import Material, Textures, read_textures
+from facediff.mesh.textures import Textures, read_textures
 from facediff.render.meshes import face_outward, vertex_normals
 from facediff.utils.colours import to_linear
 
@@ -70,8 +69,8 @@ class Format(ABC):
     up_axes: ClassVar[tuple[Up, ...]] = ("y", "z")
     """Axes that may point up."""
     uses: ClassVar[tuple[str, ...]] = ()
-    """Which of the options ``view``, ``size``, ``video_rate``, ``tolerance``, ``shapes``, ``tracks``, ``key_tolerance``
-    and ``surface`` it uses; the command line refuses others."""
+    """Which of the options ``view``, ``size``, ``tolerance``, ``shapes``, ``tracks``, ``key_tolerance`` and ``surface``
+    it uses; the command line refuses others."""
     requires: ClassVar[tuple[str, str] | None] = None
     """An optional package that writing needs: its import name, and the extra of facediff that installs it."""
 
@@ -155,28 +154,6 @@ def facts(animation: Animation, space: FileSpace) -> dict[str, object]:
 def surface_of(animation: Animation, options: ExportOptions) -> Textures | None:
     """The texture coordinates and materials that the options ask for."""
     return None if options.surface is None else read_textures(Path(options.surface), len(animation.triangles))
-
-
-def pictures_of(surface: Textures, stem: str) -> dict[int, tuple[str, bytes]]:
-    """Names and bytes of the pictures of a surface's materials, by their numbers; one file for each picture."""
-    files: dict[Path | bytes, tuple[str, bytes] | None] = {}  # materials that share a picture share its bytes
-    for picture in dict.fromkeys(material.picture for material in surface.materials if material.picture is not None):
-        content = Material("", picture=picture).picture_bytes()
-        names = sum(file is not None for file in files.values())
-        files[picture] = None if content is None else (f"{stem}_{names}{content[2]}", _marked(content[0]))
-    found = {number: files.get(material.picture or b"") for number, material in enumerate(surface.materials)}
-    return {number: file for number, file in found.items() if file is not None}
-
-
-def _marked(picture: bytes) -> bytes:
-    """A PNG or JPEG with a comment that names this program, by which the next export knows that it may replace it."""
-    if picture.startswith(b"\x89PNG"):
-        chunk = b"tEXtSoftware\0" + MARK
-        comment, place = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)), 33
-    else:  # behind the first segment, which tells a JFIF file by its place
-        comment = b"\xff\xfe" + struct.pack(">H", 2 + len(MARK)) + MARK
-        place = 4 + int.from_bytes(picture[4:6], "big") if picture[2:4] == b"\xff\xe0" else 2
-    return picture[:place] + comment + picture[place:]
 
 
 def outward(animation: Animation) -> npt.NDArray[np.int32]:

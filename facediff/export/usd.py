@@ -11,19 +11,8 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, needs_extra
-from facediff.export.format import (
-    FileSpace,
-    Format,
-    facts,
-    linear_colours,
-    normals_of,
-    outward,
-    pictures_of,
-    surface_of,
-)
-from facediff.mesh.textures import Textures
+from facediff.export.format import FileSpace, Format, facts, linear_colours, normals_of, outward, surface_of
 from facediff.registry import export_format
-from facediff.utils.colours import to_linear
 
 
 class Usd(Format):
@@ -37,7 +26,7 @@ class Usd(Format):
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write one animation; frame t is time code t."""
         with needs_extra("pxr", "usd", "writing USD"):
-            from pxr import Sdf, Tf, Usd, UsdGeom, UsdMedia
+            from pxr import Sdf, Tf, Usd, UsdGeom, UsdMedia, Vt
         (animation,) = animations
         space = FileSpace.of(animation, options)
         stage = Usd.Stage.CreateInMemory()
@@ -62,10 +51,12 @@ class Usd(Format):
         layer.customLayerData = {"facediff": data}
         layer.documentation = f"{animation.name}, written by facediff"
         try:
-            surface = surface_of(animation, options)
             mesh = _add_face(stage, root.AppendChild("face"), animation, space)
-            if surface is not None:
-                _add_materials(stage, root, mesh, animation, surface, path)
+            if (surface := surface_of(animation, options)) is not None:
+                corners = surface.uvs[surface.turned(animation.triangles, outward(animation))].reshape(-1, 2)
+                kind, rate = Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
+                coordinates = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, rate)
+                coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(corners, np.float32)))
             written, cause = layer.Export(str(path)), None
         except Tf.ErrorException as error:
             written, cause = False, error
@@ -107,51 +98,6 @@ def _add_face(stage: Any, path: Any, animation: Animation, space: FileSpace) -> 
         colour.Set(Vt.Vec3fArray.FromNumpy(linear_colours(animation.colours)))
         _colour_by_vertices(stage, path, mesh)
     return mesh
-
-
-def _add_materials(stage: Any, root: Any, mesh: Any, animation: Animation, surface: Textures, file: Path) -> None:  # noqa: ANN401
-    """Texture coordinates of the corners, and the materials of a mesh file; pictures are written next to the file."""
-    from pxr import Gf, Sdf, Tf, UsdGeom, UsdShade, Vt
-
-    faces = outward(animation)
-    coordinates = surface.uvs[surface.turned(animation.triangles, faces)].reshape(-1, 2).astype(np.float32)
-    st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(coordinates)))
-    pictures = pictures_of(surface, file.stem)
-    for number, entry in enumerate(surface.materials):
-        name = f"{Tf.MakeValidIdentifier(entry.name)}_{number}"
-        material = UsdShade.Material.Define(stage, root.AppendChild(name))
-        look = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("surface"))
-        look.CreateIdAttr("UsdPreviewSurface")
-        look.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.7)
-        colour = look.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-        colour.Set(Gf.Vec3f(*(float(part) for part in to_linear(entry.colour))))
-        if number in pictures:
-            picture, data = pictures[number]
-            file.with_name(picture).write_bytes(data)
-            reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("coordinates"))
-            reader.CreateIdAttr("UsdPrimvarReader_float2")
-            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-            texture = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("picture"))
-            texture.CreateIdAttr("UsdUVTexture")
-            texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{picture}"))
-            where = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-            texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(where)
-            for wrap in ("wrapS", "wrapT"):
-                texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("repeat")
-            colour.ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
-        material.CreateSurfaceOutput().ConnectToSource(look.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-        if len(surface.materials) == 1:
-            prim = mesh.GetPrim()
-        else:
-            prim = UsdGeom.Subset.CreateGeomSubset(
-                mesh,
-                name,
-                UsdGeom.Tokens.face,
-                Vt.IntArray.FromNumpy(np.flatnonzero(surface.of_face == number).astype(np.int32)),
-                "materialBind",
-            ).GetPrim()
-        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
 
 def _colour_by_vertices(stage: Any, path: Any, mesh: Any) -> None:  # noqa: ANN401

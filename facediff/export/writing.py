@@ -14,10 +14,10 @@ from facediff.animation.options import ExportOptions
 from facediff.errors import FaceDiffError, MissingExtraError, OptionError, check_known
 from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
-from facediff.mesh.textures import PICTURE_SUFFIXES, has_textures
+from facediff.mesh.textures import has_textures
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
-OPTIONS = ("view", "size", "video_rate", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
+OPTIONS = ("view", "size", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
 """Options that some formats use."""
 
 
@@ -59,7 +59,7 @@ def write_animations(
         animations: at least one.
         options: the user's; the defaults if None.
         into: the file of the animations' mesh: to the copy of a .glb each animation is added where that is a .glb as
-            well, else its texture coordinates and materials, or an .obj's, are written to .glb and USD.
+            well, else its texture coordinates and materials, or an .obj's, are written to .glb, and coordinates to USD.
         own_shapes: drive the shapes and bones that this .glb has, instead of adding shapes that move as the animation.
         z_up: whether z points up in that file. Formats that hold either axis then have z up too, unless the options
             choose one, so that the output fits the file.
@@ -111,10 +111,6 @@ def write_animations(
             # The format's writer names the hidden folder, which the user has never seen.
             raise FaceDiffError(str(error).replace(str(hidden), str(path.parent))) from error
         written = sorted(hidden.iterdir())
-        for file in written:
-            goal = path.with_name(file.name)
-            if file.suffix in PICTURE_SUFFIXES and file not in [hidden / target.name for target in targets]:
-                check_free(goal)  # the picture of a material has not been named by the user
         for file in written:
             put_in_place(file, path.with_name(file.name))
     first = [(folder_of(target) if form.is_folder else target).name for target in targets]

@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import methodcaller
 
 import numpy as np
@@ -165,15 +165,10 @@ class Backlog:
 
 
 @dataclass(frozen=True)
-class _Ready:
+class _Ready(LiveFrame):
     """A frame that waits for its time."""
 
-    index: int
-    spoken: float
-    ready: float
-    vertices: Array
-    values: Array | None
-    head: npt.NDArray[np.float64] | None
+    ready: float = 0.0
 
 
 class Loop:
@@ -365,7 +360,8 @@ class Loop:
                 if row == 0:
                     self.pacer.ready(speech_time, timestamp)
                 head = None if heads is None else heads[row]
-                self._frames.append(_Ready(index, speech_time, timestamp, frame_offsets, values[row], head))
+                times = index / self.model.frame_rate, speech_time
+                self._frames.append(_Ready(index, *times, frame_offsets, values[row], head=head, ready=timestamp))
             self._changed.notify()
         return first + len(points)
 
@@ -404,7 +400,7 @@ class Loop:
             if unsolved or self._late(frame):
                 self.summary.dropped += 1
             else:
-                self._send(frame, weights[1] if weights[0] == frame.index else frame.values, solving)
+                self._send(frame, weights[1] if weights[0] == frame.index else frame.weights, solving)
             if self._every is not None and time.monotonic() - reported > self._every:
                 reported = time.monotonic()
                 self._tell()
@@ -412,7 +408,7 @@ class Loop:
     def _wait_for(self, frame: _Ready) -> bool:
         """Wait until a frame is due; False if there is speech to be handed over before."""
         with self._changed:
-            while (early := self.pacer.due(frame.spoken) - time.monotonic()) > 0:
+            while (early := self.pacer.due(frame.heard) - time.monotonic()) > 0:
                 if self._spoken:
                     return False
                 self._changed.wait(early)
@@ -421,7 +417,7 @@ class Loop:
     def _late(self, frame: _Ready) -> bool:
         """Whether a frame's time has passed by more than a hop, and a later one is there, which is more urgent."""
         newer = self._frames and self._frames[-1].index > frame.index
-        return bool(newer) and time.monotonic() > self.pacer.due(frame.spoken) + self.model.hop
+        return bool(newer) and time.monotonic() > self.pacer.due(frame.heard) + self.model.hop
 
     def _still(self, frame: _Ready) -> Array:
         """Offsets of a frame's vertices without the motion of the head, which shapes of a face cannot express."""
@@ -433,20 +429,12 @@ class Loop:
 
     def _send(self, frame: _Ready, weights: Array | None, solving: float) -> None:
         began = time.monotonic()
-        out = LiveFrame(
-            index=frame.index,
-            time=frame.index / self.model.frame_rate,
-            heard=frame.spoken,
-            vertices=frame.vertices,
-            weights=weights,
-            dropped=self.summary.dropped + self._backlog.dropped,
-            head=frame.head,
-        )
+        out = replace(frame, weights=weights, dropped=self.summary.dropped + self._backlog.dropped)
         self._each(methodcaller("send", out))
         timestamp = time.monotonic()
         self.summary.frames += 1
-        self.summary.lag.add(timestamp - frame.spoken)
-        self._interval.add(timestamp - frame.spoken)
+        self.summary.lag.add(timestamp - frame.heard)
+        self._interval.add(timestamp - frame.heard)
         self.summary.waiting.add(began - frame.ready)
         self.summary.sending.add(timestamp - began + solving)
 

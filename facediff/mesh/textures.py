@@ -25,7 +25,6 @@ from facediff.utils.numerics import Array, Indices, Integers
 
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
 """How pictures begin that programs for glTF and USD read, their type and suffix."""
-PICTURE_SUFFIXES = tuple(suffix for _, suffix in PICTURES.values())
 
 
 @dataclass(frozen=True, eq=False)

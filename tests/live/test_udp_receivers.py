@@ -189,15 +189,15 @@ def test_vmc_names_may_be_vrms_vowels_and_blinks(opened: Opened, listener: Liste
 
 
 def test_plain_osc_has_an_address_for_each_weight(opened: Opened, listener: Listener) -> None:
-    opened(f"osc://127.0.0.1:{listener.port}?prefix=/me/face").send(frame(5, dropped=2))
+    opened(f"osc://127.0.0.1:{listener.port}").send(frame(5, dropped=2))
     found = {each.address: each.params for each in messages(listener.take(2))}
-    index, seconds, lag, dropped = found.pop("/me/face/frame")
-    assert found.pop("/me/face/head") == [0.0, 0.0, 0.0]
+    index, seconds, lag, dropped = found.pop("/facediff/frame")
+    assert found.pop("/facediff/head") == [0.0, 0.0, 0.0]
     assert (index, dropped) == (5, 2)
     assert seconds == pytest.approx(5 / FRAME_RATE)
     assert 0.1 <= lag < 5
     assert found == {
-        f"/me/face/weight/{name}": [pytest.approx(weight)] for name, weight in zip(ARKIT, weights_of(5), strict=True)
+        f"/facediff/weight/{name}": [pytest.approx(weight)] for name, weight in zip(ARKIT, weights_of(5), strict=True)
     }
 
 

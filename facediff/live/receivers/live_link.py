@@ -52,14 +52,13 @@ class LiveLink(UdpReceiver):
     Args:
         address: ``livelink://HOST:PORT``; this machine's port 11111 by default.
         subject: name of the face in Live Link; the performance's if empty.
-        device: identifier of this sender; if empty, one that is the same for a subject every time.
     """
 
     default_port = 11_111
 
-    def __init__(self, address: Address, *, subject: str = "", device: str = "") -> None:
+    def __init__(self, address: Address, *, subject: str = "") -> None:
         super().__init__(address)
-        self.subject, self.device = subject, device
+        self.subject = subject
         self._first: int | None = None
 
     def open(self, performance: Performance) -> None:
@@ -67,12 +66,11 @@ class LiveLink(UdpReceiver):
         self._weights = ArkitWeights(performance, self.address, (*ORDER, *ROTATIONS))
         self._turning = any(name in performance.shapes for name in ROTATIONS)
         subject = self.subject or performance.subject
-        device = self.device or str(uuid.uuid5(uuid.NAMESPACE_DNS, f"{subject}.facediff"))
-        for option, text in (("subject", subject), ("device", device)):
-            if not text.isascii() or not text.isprintable() or not 1 <= len(text) <= LONGEST_NAME:
-                raise FaceDiffError(
-                    f"{OPTION} {self.name}: {option} is {text!r}; expected 1 to {LONGEST_NAME} characters of ASCII"
-                )
+        if not subject.isascii() or not subject.isprintable() or len(subject) > LONGEST_NAME:
+            raise FaceDiffError(
+                f"{OPTION} {self.name}: subject is {subject!r}; expected up to {LONGEST_NAME} characters of ASCII"
+            )
+        device = str(uuid.uuid5(uuid.NAMESPACE_DNS, f"{subject}.facediff"))
         self._rate = Fraction(performance.frame_rate).limit_denominator(1001)
         self._head = bytes([VERSION])
         for text in (device, subject):

@@ -7,14 +7,13 @@ and the arguments, each filled up to whole words of 4 bytes; a bundle is message
 
 from __future__ import annotations
 
-import re
 import struct
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from facediff.errors import FaceDiffError, check_known
+from facediff.errors import check_known
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
@@ -51,11 +50,11 @@ def _text(text: str) -> bytes:
     return data + b"\0" * (4 - len(data) % 4)
 
 
-def bundles(messages: Sequence[bytes], most_bytes: int = MOST_BYTES) -> Iterator[bytes]:
-    """Messages in as few bundles as hold them, in their order, each of at most so many bytes."""
+def bundles(messages: Sequence[bytes]) -> Iterator[bytes]:
+    """Messages in as few bundles as hold them, in their order, each of at most :data:`MOST_BYTES`."""
     current = BUNDLE
     for packet in messages:
-        if len(current) + 4 + len(packet) > most_bytes and current != BUNDLE:
+        if len(current) + 4 + len(packet) > MOST_BYTES and current != BUNDLE:
             yield current
             current = BUNDLE
         current += struct.pack(">i", len(packet)) + packet
@@ -119,7 +118,7 @@ class Vmc(_Osc):
 
 @receiver.register("osc")
 class Osc(_Osc):
-    """Plain OSC addresses, for TouchDesigner, Max, Pure Data and one's own programs.
+    """Plain OSC addresses, for TouchDesigner, Max, Pure Data and programs of your own.
 
     A frame is ``/facediff/frame index seconds lag dropped`` (a whole number, two floats, a whole number),
     ``/facediff/head yaw pitch roll`` in radians, and a ``/facediff/weight/jawOpen weight`` for each of ARKit's 52
@@ -127,23 +126,17 @@ class Osc(_Osc):
 
     Args:
         address: ``osc://HOST:PORT``; this machine's port 9000 by default.
-        prefix: in place of ``/facediff``.
     """
 
     default_port = 9_000
 
-    def __init__(self, address: Address, *, prefix: str = "/facediff") -> None:
+    def __init__(self, address: Address) -> None:
         super().__init__(address)
-        if re.fullmatch(r"(/[A-Za-z0-9_.-]+){1,8}", prefix) is None or len(prefix) > 100:
-            raise FaceDiffError(
-                f"{OPTION} {self.name}: prefix is {prefix!r}; expected parts of an OSC address, as in /facediff"
-            )
-        self._frame, self._turned = f"{prefix}/frame", f"{prefix}/head"
-        self._parts = [message(f"{prefix}/weight/{name}", 0.0)[:-4] for name in ARKIT]
+        self._parts = [message(f"/facediff/weight/{name}", 0.0)[:-4] for name in ARKIT]
 
     def messages(self, frame: LiveFrame) -> list[bytes]:
         """The messages of a frame, in their order."""
         weights = zip(self._parts, self._weights.of(frame).tolist(), strict=True)
-        about = message(self._frame, frame.index, float(frame.time), float(frame.lag), frame.dropped)
-        turned = message(self._turned, *frame.turned.tolist())
+        about = message("/facediff/frame", frame.index, float(frame.time), float(frame.lag), frame.dropped)
+        turned = message("/facediff/head", *frame.turned.tolist())
         return [about, turned, *(part + struct.pack(">f", weight) for part, weight in weights)]
