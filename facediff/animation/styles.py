@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from facediff.animation.animation import Animation, metres_per_unit
 from facediff.animation.archives import read_archive
-from facediff.errors import FaceDiffError, OptionError
+from facediff.errors import OptionError
 from facediff.spaces import Space
 from facediff.spaces.files import ParameterClip, even, read_parameters
 from facediff.spaces.layouts import LAYOUTS, layout
@@ -223,10 +223,7 @@ def recorded_parameters(source: str, frame_rate: float) -> ParameterClip | None:
     if path.suffix == ".npy" and open_style(path).array.ndim == 1:
         return None
     if stated is None and path.suffix in (".npy", ".npz"):
-        try:
-            return read_parameters(path)  # which says what layouts fit
-        except FaceDiffError as error:
-            raise OptionError.naming(f"{{style}} {error}, as in {path.name}@LAYOUT") from error
+        return read_parameters(path)  # which says what layouts fit
     without_rate = path.suffix == ".npy" and stated in LAYOUTS and LAYOUTS[stated].frame_rate is None
     return read_parameters(path, layout=stated, frame_rate=frame_rate if without_rate else None)
 

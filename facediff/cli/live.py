@@ -16,7 +16,7 @@ from facediff.animation.options import (
 )
 from facediff.errors import FaceDiffError
 from facediff.live.options import LiveOptions
-from facediff.utils.hub import BUNDLED, check_animating_source, is_audio2face, may_have_weights, model_or_bundled
+from facediff.utils.hub import BUNDLED, check_animating_source, is_audio2face, model_or_bundled
 from facediff.utils.option import Option
 
 SOUNDS = (".wav", ".flac", ".ogg", ".mp3", ".opus")
@@ -84,7 +84,7 @@ def live(
 
         shapes = Path(BUILT_IN)
     performance = replace(performance, speech=None if speech is None else str(speech), shapes=shapes)
-    perform(performance, lambda: live_model(options), print_report, weights=may_have_weights(model))
+    perform(performance, lambda: live_model(options), print_report)
 
 
 def live_model(options: AnimationOptions) -> LiveModel:

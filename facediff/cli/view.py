@@ -10,7 +10,6 @@ from facediff.animation.options import SourceOptions
 from facediff.cli.options import Animations, check_source, with_different_names
 from facediff.cli.process import tell
 from facediff.errors import counted
-from facediff.utils import ranges
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -24,7 +23,6 @@ def view(
     truth: Annotated[Path | None, Option(metavar="FILE", reads=True, exists="file")] = None,
     labels: Annotated[list[str] | None, Option(metavar="NAME", many=True)] = None,
     shortest: bool = False,
-    max_mb: Annotated[ranges.Megabytes, Option(metavar="MB")] = 30.0,
     open: bool = False,  # noqa: A002 - the option's name
     source: SourceOptions,
 ) -> None:
@@ -41,7 +39,6 @@ def view(
         truth: the reference of the animations: shown first, and in heat maps
         labels: names to show, in the order of the panels
         shortest: cut all to the shortest instead of refusing
-        max_mb: largest page written
         open: open the page in the browser
         source: mesh, frame rate and unit of a bare .npy.
     """
@@ -53,7 +50,7 @@ def view(
     panels = with_different_names(read_animations(paths, source), paths)
     first = None if truth is None else panels.pop(0)
     page = page_of(panels, truth=first, labels=labels, shortest=shortest)
-    page.save(output, max_mb=max_mb)
+    page.save(output)
     size = output.stat().st_size / 1e6
     frames, count = len(page.animations[0].vertices), len(page.animations)
     length = f"{counted(frames, 'frame')} of {counted(count, 'animation')}"

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from facediff.errors import FaceDiffError, printable
-from facediff.live.frames import OPTION, Performance, Receiver, open_receivers
+from facediff.live.frames import OPTION, Performance, Receiver, open_receiver
 from facediff.live.loop import LiveSummary, Loop, Solver
 from facediff.live.model import LiveModel
 from facediff.live.options import LiveOptions
@@ -16,26 +16,21 @@ from facediff.live.options import LiveOptions
 Report = Callable[[str], None]
 
 
-def perform(
-    options: LiveOptions, open_model: Callable[[], LiveModel], report: Report, *, weights: bool = False
-) -> LiveSummary:
+def perform(options: LiveOptions, open_model: Callable[[], LiveModel], report: Report) -> LiveSummary:
     """Perform from the first check to the report at the end."""
     options.check()
     # What fails quickly comes first: a model takes seconds to open.
-    receivers = open_receivers(options.to or [])
-    if options.shapes is not None:
-        from facediff.editing.shapes import check_shapes
-
-        check_shapes(options.shapes)
-    weighted = [receiver.name for receiver in receivers if receiver.needs_weights]
-    unsolved = weighted and options.shapes is None
-    if unsolved and not weights:
-        raise needs_shapes(weighted[0])
+    receivers = [open_receiver(text) for text in options.to or []]
+    weighted = next((receiver.name for receiver in receivers if receiver.needs_weights), None)
     source = options.source()
     model = open_model()
-    if unsolved and not model.weights:
-        raise needs_shapes(weighted[0])
-    names, solve = (model.weights, None) if options.shapes is None or not weighted else solver(options.shapes, model)
+    if weighted is not None and options.shapes is None and not model.weights:
+        raise FaceDiffError(
+            f"{OPTION} {weighted}: sends weights of blendshapes; give --shapes: a folder of meshes, a .glb, or puppet "
+            f"for the built-in face"
+        )
+    unsolved = weighted is None or options.shapes is None
+    names, solve = (model.weights, None) if unsolved else solver(Path(str(options.shapes)), model)
     performance = Performance(
         frame_rate=model.frame_rate,
         neutral=model.neutral,
@@ -67,14 +62,6 @@ def perform(
     for sentence in summary.sentences():
         report(sentence)
     return summary
-
-
-def needs_shapes(name: str) -> FaceDiffError:
-    """That a receiver sends weights, and nothing says of which shapes."""
-    return FaceDiffError(
-        f"{OPTION} {name}: sends weights of blendshapes; give --shapes: a folder of meshes, a .glb, or puppet for the "
-        f"built-in face"
-    )
 
 
 def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:

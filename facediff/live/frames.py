@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any, cast
@@ -18,7 +17,7 @@ from urllib.parse import parse_qsl, urlsplit
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, damaged, located
+from facediff.errors import damaged, located
 from facediff.registry import receiver
 from facediff.spaces.rotations import convert
 from facediff.utils import SAMPLE_RATE
@@ -184,30 +183,20 @@ def read_address(text: str) -> Address:
     """
     expected = "expected scheme://HOST:PORT, scheme:FILE or a scheme alone, and options as ?name=value&name=value"
     with damaged(f"{OPTION} {text}", expected):
-        return _parts(text)
-
-
-def _parts(text: str) -> Address:
-    """The parts of an address; ValueError if it is none."""
-    scheme, colon, rest = text.partition(":")
-    if not colon:
-        scheme, question, rest = text.partition("?")
-        rest = question + rest
-    if re.fullmatch(r"[a-z][a-z0-9_]*", scheme) is None:
-        raise ValueError(f"{scheme!r} is no scheme")
-    rest, _, query = rest.partition("?")
-    pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query), max_num_fields=20)
-    host, port, path = None, None, rest
-    if rest.startswith("//"):
-        parts = urlsplit(f"{scheme}:{rest}")
-        host, port, path = parts.hostname, parts.port, parts.path.removeprefix("/")
-        if parts.username is not None or parts.fragment or not host:
-            raise ValueError("the host is wrong")
-    elif rest.isdecimal():
-        port, path = int(rest), ""
-    if port is not None and not 0 < port <= 65_535:
-        raise ValueError(f"port {port} does not exist")
-    return Address(text, scheme, host, port, path, dict(pairs))
+        address, _, query = text.partition("?")
+        scheme, _, rest = address.partition(":")
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query), max_num_fields=20)
+        host, port, path = None, None, rest
+        if rest.startswith("//"):
+            parts = urlsplit(f"{scheme}:{rest}")
+            host, port, path = parts.hostname, parts.port, parts.path.removeprefix("/")
+            if parts.username is not None or parts.fragment or not host:
+                raise ValueError("the host is wrong")
+        elif rest.isdecimal():
+            port, path = int(rest), ""
+        if re.fullmatch(r"[a-z][a-z0-9_]*", scheme) is None or port not in (None, *range(1, 65_536)):
+            raise ValueError("the scheme or the port does not exist")
+        return Address(text, scheme, host, port, path, dict(pairs))
 
 
 def open_receiver(text: str) -> Receiver:
@@ -217,11 +206,3 @@ def open_receiver(text: str) -> Receiver:
         implementation = receiver.get(address.scheme)
     options = receiver.options(address.scheme, list(address.options.items()), f"{OPTION} {text}")
     return cast(Receiver, implementation(address, **options))
-
-
-def open_receivers(texts: Sequence[str]) -> list[Receiver]:
-    """The receivers at several addresses, none of which is given twice."""
-    for number, text in enumerate(texts):
-        if text in texts[:number]:
-            raise FaceDiffError(f"{OPTION} {text}: is given twice; give every receiver once")
-    return [open_receiver(text) for text in texts]

@@ -18,7 +18,6 @@ from facediff.animation import Animation
 from facediff.animation.archives import AnimationFacts, complete, facts_of, read_animation
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
 from facediff.errors import FaceDiffError, OptionError, check_known, note, refuse_idle
-from facediff.utils import ranges
 from facediff.utils.hub import bundled_by_name, is_graphs
 from facediff.utils.paths import from_home
 
@@ -144,22 +143,13 @@ class Page:
     def __init__(self, animations: Sequence[Animation], truth: int | None = None) -> None:
         self.animations, self.truth = list(animations), truth
 
-    @ranges.checked
-    def save(self, path: str | Path, *, max_mb: ranges.Megabytes = 30.0) -> Path:
-        """Write the page to a file.
-
-        Args:
-            path: the .html file.
-            max_mb: largest file written, in megabytes.
-
-        Raises:
-            FaceDiffError: if the file would be larger or cannot be written.
-        """
+    def save(self, path: str | Path) -> Path:
+        """Write the page to an .html file."""
         from facediff.export.viewer import write_page
 
         path = Path(path)
         check_known(path, "format of a page", [path.suffix], (".html", ".htm"))
-        write_page(path, self.animations, max_mb=max_mb, truth=self.truth)
+        write_page(path, self.animations, truth=self.truth)
         return path
 
     def html(self) -> str:

@@ -31,6 +31,7 @@ CIVIDIS = (
     "8b8778 9a9376 aaa073 bbad6d ccba64 ddc858 efd748 fee838"
 )
 """Seventeen colours of :func:`heat_ramp`, at equal steps."""
+GAP = 6  # Pixels between the pictures of a sheet
 MOST_THREADS = 8  # An encoder takes pictures one by one, and more than these would wait for it
 
 
@@ -58,28 +59,18 @@ def side_by_side(
     """
     drawers = [renderers] * len(motions) if isinstance(renderers, Renderer) else list(renderers)
     tints = list(colours) if colours is not None else [None] * len(motions)
-    if len({len(motion) for motion in motions}) != 1:
-        lengths = ", ".join(f'"{label}" {len(motion)}' for label, motion in zip(labels, motions, strict=True))
-        raise FaceDiffError(f"the motions differ in length (frames: {lengths}): cut them to one length")
-    return _frames(drawers, motions, labels, tints, footer)
-
-
-def _frames(
-    renderers: Sequence[Renderer],
-    motions: Sequence[Motion],
-    labels: Sequence[str],
-    colours: Sequence[npt.NDArray[np.generic] | None],
-    footer: str | None,
-) -> Iterator[Frame]:
-    threads = min(drawing_threads(), len(motions[0]))
+    # One in a process that is itself one of several workers.
+    threads = 1 if multiprocessing.parent_process() is not None else min(processors(), MOST_THREADS)
+    (count,) = {len(motion) for motion in motions}
+    threads = min(threads, count)
     # A renderer draws one picture at a time: each thread takes a set of them and gives it back.
-    idle_sets = [renderers, *([renderer.twin() for renderer in renderers] for _ in range(threads - 1))]
+    idle_sets = [drawers, *([renderer.twin() for renderer in drawers] for _ in range(threads - 1))]
     labelled = any(text.strip() for text in labels)
 
     def draw(index: int) -> Frame:
         set_of_renderers = idle_sets.pop()
         panels = []
-        for renderer, motion, label, tint in zip(set_of_renderers, motions, labels, colours, strict=True):
+        for renderer, motion, label, tint in zip(set_of_renderers, motions, labels, tints, strict=True):
             frame_tint = tint[index] if tint is not None and np.ndim(tint) == 3 else tint
             panel = renderer.render(motion[index], colours=frame_tint)
             panels.append(_caption(panel, label, "top", INK, renderer.backdrop[:1]) if labelled else panel)
@@ -87,12 +78,7 @@ def _frames(
         row = np.hstack(panels)
         return row if not footer else _caption(row, footer, "bottom", FAINT_INK)
 
-    return _in_order(draw, len(motions[0]), threads)
-
-
-def drawing_threads() -> int:
-    """Threads that draw: as many as processors, and one where this process is itself one of several workers."""
-    return 1 if multiprocessing.parent_process() is not None else min(processors(), MOST_THREADS)
+    return _in_order(draw, count, threads)
 
 
 def _in_order(draw: Callable[[int], Frame], count: int, threads: int) -> Iterator[Frame]:
@@ -160,20 +146,11 @@ def heat_ramp() -> Frame:
     return np.rint(np.stack(ramp, axis=1)).astype(np.uint8)
 
 
-def heat_colours(values: npt.NDArray[np.floating], highest: float, lowest: float = 0.0) -> Frame:
-    """Colours of values; values outside the scale get the colour of its nearer end.
-
-    Args:
-        values: numbers of any shape, such as distances (V,) or (T, V).
-        highest: value of the last colour.
-        lowest: value of the first colour.
-
-    Returns:
-        sRGB, of the values' shape and one axis of 3 more.
-    """
-    if not (highest > lowest and np.isfinite(values).all()):
-        raise FaceDiffError(f"a heat map from {lowest} to {highest} has no extent, or its values are not finite")
-    levels = np.rint((np.asarray(values, np.float64) - lowest) * (255 / (highest - lowest)))
+def heat_colours(values: npt.NDArray[np.floating], highest: float) -> Frame:
+    """Colours (…, 3), sRGB, of values (…) from 0 to ``highest``; those outside get the colour of the nearer end."""
+    if not (highest > 0 and np.isfinite(values).all()):
+        raise FaceDiffError(f"a heat map from 0 to {highest} has no extent, or its values are not finite")
+    levels = np.rint(np.asarray(values, np.float64) * (255 / highest))
     return heat_ramp()[np.clip(levels, 0, 255).astype(np.uint8)]
 
 
@@ -190,24 +167,17 @@ def _heat_key(ground: Frame, lowest: str, highest: str) -> Frame:
     return key
 
 
-def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str] | None = None, gap: int = 6) -> Frame:
-    """Pictures of one size in rows, on white.
-
-    Args:
-        frames: pictures (height, width, 3).
-        columns: pictures per row.
-        labels: a text per picture, on a strip above it.
-        gap: pixels between pictures.
-    """
+def contact_sheet(frames: Iterable[Frame], columns: int, *, labels: Sequence[str] | None = None) -> Frame:
+    """Pictures (height, width, 3) of one size in rows, on white, each with its label on a strip above it."""
     pictures = list(frames)
     if labels is not None:
         pictures = [_caption(picture, label, "top", INK) for picture, label in zip(pictures, labels, strict=True)]
     height, width, _ = pictures[0].shape
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
-    sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, np.uint8)
+    sheet = np.full((rows * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3), 255, np.uint8)
     for index, picture in enumerate(pictures):
-        top, left = index // columns * (height + gap), index % columns * (width + gap)
+        top, left = index // columns * (height + GAP), index % columns * (width + GAP)
         sheet[top : top + height, left : left + width] = picture
     return sheet
 

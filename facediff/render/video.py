@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, needs_extra
+from facediff.errors import needs_extra
 from facediff.utils.files import atomic
 
 if TYPE_CHECKING:
@@ -84,36 +85,18 @@ def write_video(
         >>> write_video("hello.mp4", frames, 25, speech, 16_000)  # doctest: +SKIP
         127
     """
-    target = Path(path)
-    codecs = CONTAINERS.get(target.suffix.lower())
-    if codecs is None:
-        raise FaceDiffError(
-            f'video file "{target}" must end in {" or ".join(CONTAINERS)}: other containers are not written.'
-        )
-    rate = Fraction(frame_rate).limit_denominator(1001)
-    sound = None if audio is None else np.asarray(audio, np.float32)
-    with atomic(target) as partial:
-        return _encode(partial, frames, rate, sound, sample_rate or 0, codecs)
-
-
-def _encode(
-    path: Path,
-    frames: Iterable[Frame],
-    rate: Fraction,
-    sound: npt.NDArray[np.float32] | None,
-    hertz: int,
-    codecs: Codecs,
-) -> int:
-    """Encode everything into `path`; the first frame sets the size. Returns the number of frames."""
     with needs_extra("av", "render", "writing videos"):
         import av
-    iterator = iter(frames)
-    first = next(iterator, None)
-    if first is None:
-        raise FaceDiffError("there are no frames to write: check that the motion is not empty")
+    codecs = CONTAINERS[Path(path).suffix.lower()]
+    rate = Fraction(frame_rate).limit_denominator(1001)
+    sound = None if audio is None else np.asarray(audio, np.float32)
+    pictures = iter(frames)
+    first = next(pictures)  # sets the size
     # Opening creates the file; bitexact keeps version strings and dates out of it.
-    with av.open(str(path), "w", options={**codecs.container, "fflags": "+bitexact"}) as container:
-        return _Encoder(container, rate, (first.shape[0], first.shape[1]), sound, hertz, codecs).run(first, iterator)
+    options = {**codecs.container, "fflags": "+bitexact"}
+    with atomic(Path(path)) as partial, av.open(str(partial), "w", options=options) as container:
+        encoder = _Encoder(container, rate, (first.shape[0], first.shape[1]), sound, sample_rate or 0, codecs)
+        return encoder.run(chain([first], pictures))
 
 
 class _Encoder:
@@ -152,21 +135,19 @@ class _Encoder:
             # Sound of the same rate passes unchanged.
             self.resampler = av.AudioResampler(format="fltp", layout="mono", rate=out_rate)
 
-    def run(self, first: Frame, rest: Iterator[Frame]) -> int:
+    def run(self, frames: Iterable[Frame]) -> int:
         """Encode all frames and all of the sound; returns the number of frames."""
-        self.add_frame(first)
-        count = 1
-        for frame in rest:
+        for frame in frames:
             self.add_frame(frame)
-            count += 1
-            self.add_sound(int(count / self.rate * self.hertz))
+            if self.pictures > 1:
+                self.add_sound(int(self.pictures / self.rate * self.hertz))
         self.container.mux(self.video.encode(None))
         if self.sound is not None:
             self.add_sound(len(self.sound))
-            for frame in self.resampler.resample(None):
-                self.container.mux(self.audio.encode(frame))
+            for part in self.resampler.resample(None):
+                self.container.mux(self.audio.encode(part))
             self.container.mux(self.audio.encode(None))
-        return count
+        return self.pictures
 
     def add_frame(self, frame: Frame) -> None:
         """Encode one picture."""

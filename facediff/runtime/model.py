@@ -93,8 +93,6 @@ class RuntimeModel(ExportedGraphs):
             progress: wraps the iteration over the seconds of a long recording.
         """
         audio = np.ascontiguousarray(audio, np.float32)
-        if audio.ndim != 1 or not np.isfinite(audio).all():
-            raise FaceDiffError(f"audio: is {audio.dtype} {audio.shape}; expected finite samples (S,) at 16 kHz")
         frames = self.clock.frames(len(audio))
         if frames < 1:
             raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")

@@ -88,7 +88,8 @@ class ExportedStyles(StyleReader[RuntimeStyle]):
         """The style vector (S,) of a face that keeps still; None where the folder has no style encoder."""
         if not self.model.has("style"):
             return None
-        return encode_style(self.model, np.zeros((1, *_points(self.model)), np.float32), "still").vector
+        points = len(self.space.channels) or self.vertices
+        return encode_style(self.model, np.zeros((1, points, self.space.dims), np.float32), "still").vector
 
     def encode(self, name: str, offsets: Array) -> RuntimeStyle:
         """The style of reference motion: offsets (T, points, dims) from rest."""
@@ -110,15 +111,5 @@ def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyl
             f"style: the folder has no style encoder, so {model.description.model} takes styles by name alone; "
             f"choose one of {', '.join(model.description.styles[:5])}, or export the model again"
         )
-    points = _points(model)
-    motion = np.ascontiguousarray(motion, np.float32)
-    if motion.ndim != 3 or not len(motion) or motion.shape[1:] != points or not np.isfinite(motion).all():
-        raise FaceDiffError(f"style: is {motion.shape}; expected finite offsets (frames, {points[0]}, {points[1]})")
-    inputs = {"motion": motion[None], "mask": np.ones((1, len(motion)), bool)}
+    inputs = {"motion": np.ascontiguousarray(motion, np.float32)[None], "mask": np.ones((1, len(motion)), bool)}
     return RuntimeStyle(name, model.run("style", inputs)[0][0])
-
-
-def _points(model: ExportedGraphs) -> tuple[int, int]:
-    """Points of a frame, and numbers of a point."""
-    space = model.description.motion_space
-    return len(space.channels) or model.arrays["templates"].shape[1], space.dims

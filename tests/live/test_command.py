@@ -95,7 +95,7 @@ def test_weights_of_a_model_of_channels_are_sent_as_they_are(speech: Path) -> No
     facts = {"neutral": neutral, "start": lambda: Channels(fake.start(), np.zeros((4, 3), np.float32))}
     model = LiveModel(**{**vars(fake), **facts, "decoder": ChannelDecoder(space, np.zeros(4), neutral, deltas)})
     options = LiveOptions(speech=str(speech), to=["keep:1?weights=true", "keep:2"])
-    perform(options, lambda: model, str, weights=True)
+    perform(options, lambda: model, str)
     assert MADE[0].performance is not None
     assert MADE[0].performance.shapes == space.channels
     for frame in (frame for made in MADE for frame in made.frames):
@@ -103,7 +103,7 @@ def test_weights_of_a_model_of_channels_are_sent_as_they_are(speech: Path) -> No
         np.testing.assert_allclose(frame.weights, [frame.index / 100, 0, 0, 0], atol=1e-6)
         np.testing.assert_allclose(frame.vertices, frame.index / 100 * deltas[0], atol=1e-5)
     with pytest.raises(FaceDiffError, match="shapes"):
-        perform(options, fake_model, str, weights=True)
+        perform(options, fake_model, str)
 
 
 def test_the_model_that_comes_with_facediff_has_its_own_shapes(speech: Path) -> None:

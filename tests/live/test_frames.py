@@ -8,7 +8,7 @@ import pytest
 
 from facediff import registry
 from facediff.errors import FaceDiffError
-from facediff.live.frames import Address, LiveFrame, Performance, Receiver, open_receiver, open_receivers, read_address
+from facediff.live.frames import Address, LiveFrame, Performance, Receiver, open_receiver, read_address
 from facediff.registry import Kind
 from facediff.utils.ranges import Range
 
@@ -73,10 +73,3 @@ def test_options_of_an_address_are_the_constructors() -> None:
     made = open_receiver("noted://here:1?subject=Ann&rate=7")
     assert isinstance(made, Noted)
     assert (made.subject, made.rate, made.name) == ("Ann", 7, "noted://here:1?subject=Ann&rate=7")
-
-
-@pytest.mark.usefixtures("noted")
-def test_one_receiver_is_given_once() -> None:
-    assert len(open_receivers(["noted:1", "noted:2"])) == 2
-    with pytest.raises(FaceDiffError, match="noted:1"):
-        open_receivers(["noted:1", "noted:2", "noted:1"])

@@ -53,10 +53,10 @@ def test_side_by_side_mixes_topologies_and_colours(renderer: Renderer, sphere: M
 
 def test_contact_sheet_places_pictures_row_by_row() -> None:
     pictures = [np.full((10, 12, 3), 10 * index, np.uint8) for index in range(5)]
-    sheet = contact_sheet(iter(pictures), 3, gap=2)
-    assert sheet.shape == (22, 40, 3)
-    assert [int(sheet[5, 5 + 14 * column, 0]) for column in range(3)] == [0, 10, 20]
-    assert [int(sheet[17, 5 + 14 * column, 0]) for column in range(3)] == [30, 40, 255]
+    sheet = contact_sheet(iter(pictures), 3)
+    assert sheet.shape == (26, 48, 3)
+    assert [int(sheet[5, 5 + 18 * column, 0]) for column in range(3)] == [0, 10, 20]
+    assert [int(sheet[21, 5 + 18 * column, 0]) for column in range(3)] == [30, 40, 255]
     assert contact_sheet(pictures, 3, labels=list("abcde")).shape[0] > 26
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -74,10 +73,10 @@ class PageFormat(Format):
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
         """Write a page that shows all animations next to each other."""
         shown = [animation if not options.no_speech else replace(animation, speech=None) for animation in animations]
-        write_page(path, shown, max_mb=math.inf)
+        write_page(path, shown)
 
 
-def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 30.0, truth: int | None = None) -> None:
+def write_page(path: Path, animations: Sequence[Animation], *, truth: int | None = None) -> None:
     """Write one self-contained HTML file that plays animations side by side with their speech.
 
     It loads nothing: no script, font or picture from elsewhere; its content security policy forbids it. Positions are
@@ -88,27 +87,21 @@ def write_page(path: Path, animations: Sequence[Animation], *, max_mb: float = 3
         path: the .html file.
         animations: 1 to 4 animations of one frame rate and one length, each with its own mesh. The page plays the
             speech of the first animation that has any.
-        max_mb: the largest file that is written, in megabytes (10⁶ bytes).
         truth: number of the reference animation, from 0; others of its topology get a heat map of the Euclidean
             distance of each vertex from it.
     """
     check_writable(path)
-    with atomic(path) as temporary:
-        with temporary.open("w", encoding="utf-8", newline="\n") as stream:
-            stream.writelines(page_parts(animations, truth=truth))
-        size = temporary.stat().st_size / 1_000_000
-        if size > max_mb:
-            raise FaceDiffError(
-                f"{path}: would have {size:.1f} MB, more than the limit of {max_mb:g} MB; show fewer or shorter "
-                f"animations, or raise the limit (`facediff view --max-mb`)"
-            )
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.writelines(page_parts(animations, truth=truth))
 
 
 def page_parts(animations: Sequence[Animation], *, truth: int | None = None) -> Iterator[str]:
     """The text of the page in pieces, in order, as :func:`write_page` writes it."""
     check_page(animations)
     blobs = Blobs()
-    return _page_parts(_page_facts(animations, truth, blobs), blobs)
+    facts = _page_facts(animations, truth, blobs)
+    values = {"title": html.escape(" · ".join(animation.name for animation in animations))}
+    return assemble("page.html", ("style.css",), SCRIPTS, values, facts, blobs, loads="img-src data:; media-src blob:")
 
 
 def check_page(animations: Sequence[Animation]) -> None:
@@ -193,59 +186,41 @@ def _direction_facts() -> dict[str, Any]:
     }
 
 
-def _head_in_mm(head: npt.NDArray[np.float64], animation: Animation) -> bytes:
-    """The motion of the head (T, 6), its shifts in mm."""
-    return (head * np.repeat([1.0, millimetres(animation)], 3)).astype("<f4").tobytes()
-
-
-def _weights_of(animation: Animation, blobs: Blobs) -> dict[str, int]:
-    """How much each vertex belongs to each region, in 255ths, for the preview of expressiveness."""
-    blob_numbers = {}
-    for name in animation.regions:
-        weights = region_factors(animation.template, animation.regions, {name: 1.0, ALL: 0.0})
-        blob_numbers[name] = blobs.add(np.rint(255 * weights).astype(np.uint8).tobytes())
-    return blob_numbers
-
-
 def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict[str, Any]:
     """One animation: its arrays in mm among the blobs, and its names and numbers."""
+
+    def number(array: npt.ArrayLike | None, kind: str) -> int | None:
+        return None if array is None or not np.size(array) else blobs.add(np.asarray(array).astype(kind).tobytes())
+
     centre, extent = bounds(animation)
-    opening = mouth_opening(animation)
-    pairs = animation.inner_lip_pairs
     template = np.asarray(animation.template, np.float64) * millimetres(animation)
     made_with = direction.direction_of(animation)
+    regions = animation.regions
+    # How much each vertex belongs to each region, in 255ths, for the preview of expressiveness.
+    shares = {name: 255 * region_factors(animation.template, regions, {name: 1.0, ALL: 0.0}) for name in regions}
+    head = animation.head
     return {
         "name": animation.name,
         "vertices": len(animation.template),
         "triangles": len(animation.triangles),
         **pack_mesh(template, outward(animation), animation.colours, blobs),
-        "opening": None if opening is None else blobs.add(opening.astype("<f4").tobytes()),
+        "opening": number(mouth_opening(animation), "<f4"),
         "chunks": pack_motion(animation, blobs),
         "centre": centre,
         "extent": extent,
         "compared": compared,
-        "pairs": None if pairs is None or not len(pairs) else blobs.add(pairs.astype("<i4").tobytes()),
-        "regions": {
-            name: blobs.add(np.asarray(indices, "<i4").tobytes()) for name, indices in animation.regions.items()
-        },
-        "head": None if animation.head is None else blobs.add(_head_in_mm(animation.head, animation)),
+        "pairs": number(animation.inner_lip_pairs, "<i4"),
+        "regions": {name: blobs.add(np.asarray(indices, "<i4").tobytes()) for name, indices in regions.items()},
+        "head": None if head is None else number(head * np.repeat([1.0, millimetres(animation)], 3), "<f4"),
         "fields": pose_fields(animation, blobs),
         "acted": acted_curves(animation, blobs),
         "weighted": channel_facts(animation, blobs),
-        "weights": _weights_of(animation, blobs),
+        "weights": {name: number(np.rint(share), "u1") for name, share in shares.items()},
         "neck": (neck(animation.template) * millimetres(animation)).round(3).tolist(),
         "direction": None if made_with is None else made_with.rows(),
         "insteadOf": [] if made_with is None else list(made_with.instead_of),
         "metadata": {str(key): str(value) for key, value in animation.metadata.items()},
     }
-
-
-def _page_parts(facts: dict[str, Any], blobs: Blobs) -> Iterator[str]:
-    """The text of the page in pieces, in order."""
-    title = html.escape(" · ".join(animation["name"] for animation in facts["animations"]))
-    return assemble(
-        "page.html", ("style.css",), SCRIPTS, {"title": title}, facts, blobs, loads="img-src data:; media-src blob:"
-    )
 
 
 def assemble(

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from facediff.animation import Animation
 from facediff.editing.controls.direction import METADATA, Direction, Key, channel_of
 from facediff.editing.controls.expressiveness import region_factors
-from facediff.errors import FaceDiffError
 from facediff.export.viewer import write_page
 from facediff.render.panels import heat_ramp
 from tests.fakes.clicks import FRAMES, OPEN_FRAMES, OPENING, RATE, SAMPLE_RATE, clicks
@@ -235,20 +234,6 @@ def test_page_is_the_same_every_time(tmp_path: Path) -> None:
     for name in "ab":
         write_page(tmp_path / f"{name}.html", [clicks()])
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
-
-
-def test_page_above_the_limit_is_refused_and_the_old_one_stays(tmp_path: Path) -> None:
-    path = tmp_path / "a.html"
-    write_page(path, [random_animation(0)])
-    before = path.read_bytes()
-    with pytest.raises(FaceDiffError, match=r"would have (\d+\.\d) MB, more than the limit of 0.2 MB") as error:
-        write_page(path, [random_animation(1, frames=900, vertices=99)], max_mb=0.2)
-    assert "--max-mb" in str(error.value)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-    write_page(tmp_path / "b.html", [random_animation(1, frames=900, vertices=99)], max_mb=30)
-    found = float(str(error.value).split("would have ")[1].split(" MB")[0])
-    assert (tmp_path / "b.html").stat().st_size / 1e6 == pytest.approx(found, abs=0.05)
 
 
 def test_the_page_has_each_faces_own_colours(tmp_path: Path) -> None:
