@@ -304,7 +304,6 @@ class Judgement:
         facts: how it was put on the open face, its licence and so on, by title.
         seconds: of the processor for a second of speech; None if not measured.
         memory: bytes at most; None if not known.
-        openings: (T,) in metres or radians, of the first clip, for the plot.
         problem: why there are no scores; empty if there are.
     """
 
@@ -315,7 +314,6 @@ class Judgement:
     seconds: float | None = None
     memory: float | None = None
     frame_rate: float = 25.0
-    openings: Array | None = None
     problem: str = ""
 
     def seen(self) -> list[FaultVerdict]:
@@ -344,8 +342,8 @@ class Judgement:
 
 def judge(
     clips: Sequence[SpokenClip], motions: Mapping[str, SpokenMotion], frame_rate: float, jaw: int | None
-) -> tuple[dict[str, float], dict[str, dict[str, float]], Array]:
-    """The scores of a model and of its planted faults, and the mouth's opening in the first clip."""
+) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """The scores of a model and of its planted faults."""
     truths = {clip.name: reference(clip, frame_rate) for clip in clips}
     sound = RefereeScores(frame_rate, jaw)
     for clip in clips:
@@ -360,7 +358,7 @@ def judge(
             points = fault.spoil(motion, motions[another(clip, clips).name], frame_rate, open_face())
             spoilt.add(clip, SpokenMotion(points, motion.head), truths[clip.name])
         faults[name] = spoilt.scores()
-    return sound.scores(), faults, sound.opening(motions[clips[0].name].points)
+    return sound.scores(), faults
 
 
 def another(clip: SpokenClip, clips: Sequence[SpokenClip]) -> SpokenClip:
@@ -380,5 +378,4 @@ def reference_judgement(clips: Sequence[SpokenClip], frame_rate: float = 25.0) -
     for clip in clips:
         motion = reference(clip, frame_rate)
         scores.add(clip, motion, motion)
-    openings = scores.opening(reference(clips[0], frame_rate).points)
-    return Judgement("reference", scores.scores(), frame_rate=frame_rate, openings=openings)
+    return Judgement("reference", scores.scores(), frame_rate=frame_rate)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from facediff.benchmark.referee import FAULTS, SCORES, Judgement
 from facediff.reporting.documents import (
@@ -15,7 +13,6 @@ from facediff.reporting.documents import (
     NONE,
     Block,
     Bullets,
-    Drawing,
     Paragraph,
     ReportTable,
     Title,
@@ -24,12 +21,8 @@ from facediff.reporting.documents import (
     terminal_text,
     write_texts,
 )
-from facediff.reporting.drawing import has_matplotlib, line_style, listed, plot_svg
 from facediff.synthetic.spoken_set import LANGUAGES, SpokenClip
 from facediff.utils.plain_files import write_json, write_rows
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 NAME = "referee"
 ARROWS = {"higher": " ↑", "lower": " ↓", "zero": " →0", "one": " →1"}
@@ -49,14 +42,8 @@ class RefereeReport:
 
 def write_report(report: RefereeReport, folder: Path) -> list[Path]:
     """Write all forms into a folder; the files."""
-    drawing = openings(report)
-    files = write_texts(
-        folder,
-        {
-            f"{NAME}.md": markdown(document(report)),
-            f"{NAME}.html": html_page("Referee", document(report, [] if drawing is None else [drawing])),
-        },
-    )
+    blocks = document(report)
+    files = write_texts(folder, {f"{NAME}.md": markdown(blocks), f"{NAME}.html": html_page("Referee", blocks)})
     write_rows(folder / f"{NAME}.csv", csv_rows(report))
     write_json(folder / f"{NAME}.json", content(report))
     return [*files, folder / f"{NAME}.csv", folder / f"{NAME}.json"]
@@ -67,7 +54,7 @@ def text(report: RefereeReport) -> str:
     return "\n" + terminal_text([scores_table(report), *languages_and_costs(report), Bullets(self_check(report))])
 
 
-def document(report: RefereeReport, drawings: Sequence[Drawing] = ()) -> list[Block]:
+def document(report: RefereeReport) -> list[Block]:
     """The whole report."""
     languages = {LANGUAGES[clip.language].name for clip in report.clips}
     return [
@@ -78,7 +65,6 @@ def document(report: RefereeReport, drawings: Sequence[Drawing] = ()) -> list[Bl
         ),
         scores_table(report),
         *languages_and_costs(report),
-        *drawings,
         Title("Check of the scores", 2),
         Paragraph("Faults were planted in every model's motion; the scores that must detect them must be worse."),
         Bullets(self_check(report)),
@@ -165,25 +151,6 @@ def self_check(report: RefereeReport) -> list[str]:
             verdict = "the referee sees" if checks and count == len(checks) else "NOT SEEN by all scores:"
             lines.append(f"{verdict if checks else 'no score for'} {row.name}, {planted.title}: {'; '.join(changes)}")
     return lines
-
-
-def openings(report: RefereeReport) -> Drawing | None:
-    """The mouth's opening over the first sentence; None without matplotlib, or where no model has the open face."""
-    rows = [row for row in report.rows if row.openings is not None and "gap" in row.scores]
-    if not rows or not has_matplotlib():
-        return None
-
-    def draw(axes: Axes) -> None:
-        for number, row in enumerate([report.reference, *rows]):
-            if row.openings is not None:
-                style = {"color": "black", "linewidth": 0.9} if number == 0 else line_style(number - 1)
-                times = np.arange(len(row.openings)) / row.frame_rate
-                axes.plot(times, 1000 * row.openings, label=listed(row.name), **style)
-        axes.set_xlabel("s")
-        axes.set_ylabel("opening of the lips, mm")
-
-    caption = f"The mouth's opening: {report.clips[0].text}"
-    return Drawing(plot_svg(draw, caption, width=8.0, height=2.6), caption)
 
 
 def csv_rows(report: RefereeReport) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Self
 from facediff.benchmark.cells import Cell, hash_of
 from facediff.errors import FaceDiffError
 from facediff.utils.limits import check_format, quoted
-from facediff.utils.plain_files import load_json, read_rows, write_json
+from facediff.utils.plain_files import load_json, write_json
 from facediff.utils.provenance import Provenance, provenance_of, read_provenance
 from facediff.utils.ranges import Range
 from facediff.utils.records import read_record
@@ -23,10 +23,6 @@ CELLS = "cells"
 FORMAT = 1
 """Goes up when a field changes its meaning; new fields do not count."""
 REMEDY = "remove the file, and run the benchmark again"
-CURVES = ("val/lve", "val/energy", "val/mve")
-"""Scores of validation that are kept over the steps of training."""
-
-
 COUNTS = Range(0, 1e12)
 """Frames, sequences, weights and seconds that a result can have."""
 
@@ -73,7 +69,6 @@ class Result:
         scores: a row for each split and method (``model``, ``still``, ``mean_face``, ``shuffled``), with regions,
             frames and sequences.
         sequences: a row for each split, method and clip.
-        curve: lists by name: steps, seconds, and scores of validation.
     """
 
     row: str
@@ -94,7 +89,6 @@ class Result:
     columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
     scores: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method")] = ()
     sequences: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method", "clip")] = ()
-    curve: Mapping[str, Sequence[float | None]] = field(default_factory=dict)
     name: str = ""
 
     @classmethod
@@ -180,14 +174,9 @@ def model_result(
     *,
     machine: Mapping[str, Any],
     measured: Mapping[str, Mapping[str, float | None]],
-    curve: Mapping[str, Sequence[float | None]],
     source: str,
 ) -> Result:
     """The result of a cell from the report of ``facediff test``."""
-    fitted = sum(step.get("seconds") or 0.0 for name, step in measured.items() if not name.startswith("test"))
-    steps = [value for value in curve.get("step", ()) if value is not None]
-    # Validation is logged with steps; the time of the training is divided evenly among them.
-    seconds = {"seconds": [fitted * value / steps[-1] for value in steps]} if steps and steps[-1] else {}
     return Result(
         **_of(cell),
         code=code_of(),
@@ -201,7 +190,6 @@ def model_result(
         columns={name: facts for name, facts in report["columns"].items() if name != "real_time_factor"},
         scores=report["scores"],
         sequences=report["sequences"],
-        curve={**curve, **seconds},
     )
 
 
@@ -276,18 +264,3 @@ def pool(rows: Sequence[Mapping[str, Any]], column: str, pooling: str | None) ->
     valued = [(row[column], row["frames"] if pooling == "frames" else 1) for row in rows if row.get(column) is not None]
     total = sum(weight for _, weight in valued)
     return None if pooling is None or not total else sum(value * weight for value, weight in valued) / total
-
-
-def curve_of(path: Path) -> dict[str, list[float | None]]:
-    """The scores of validation over the steps of a training, as ``metrics.csv`` of its run has them."""
-    if not path.is_file():
-        return {}
-    by_step: dict[float, dict[str, float]] = {}
-    for row in read_rows(path, remedy="expected a metrics.csv of CSVLogger"):
-        values = {name: float(row[name]) for name in CURVES if row.get(name)}
-        if values and row.get("step"):
-            by_step.setdefault(float(row["step"]) + 1, {}).update(values)
-    steps = sorted(by_step)
-    names = [name for name in CURVES if any(name in values for values in by_step.values())]
-    curve: dict[str, list[float | None]] = {name: [by_step[step].get(name) for step in steps] for name in names}
-    return {"step": [*steps], **curve} if steps else {}

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from facediff.benchmark.cells import Cell, Training, config_content, hash_of
-from facediff.benchmark.results import CELLS, Result, cell_file, curve_of, model_result, predictions_result, read_result
+from facediff.benchmark.results import CELLS, Result, cell_file, model_result, predictions_result, read_result
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
@@ -138,8 +138,7 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
     }
     runner.run(run.name, [*arguments, *option_words(options)])
     report = load_json(run / REPORT)
-    curves = {} if not cell.trainings else curve_of(folder / cell.trainings[-1].name / "version_0" / "metrics.csv")
-    return model_result(cell, report, machine=machine, measured=runner.measured, curve=curves, source=str(checkpoint))
+    return model_result(cell, report, machine=machine, measured=runner.measured, source=str(checkpoint))
 
 
 def _score_predictions(setting: Setting, cell: Cell, folder: Path, machine: dict[str, Any]) -> Result:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from facediff.benchmark.plots import plots_of
 from facediff.benchmark.significance import Difference, RowScores
 from facediff.benchmark.tables import BenchmarkReport, Table, TableRow
 from facediff.errors import FaceDiffError
@@ -16,7 +15,6 @@ from facediff.reporting.documents import (
     NONE,
     Block,
     Bullets,
-    Drawing,
     Paragraph,
     ReportTable,
     Title,
@@ -28,7 +26,6 @@ from facediff.reporting.documents import (
     terminal_text,
     write_texts,
 )
-from facediff.reporting.drawing import has_matplotlib
 from facediff.reporting.statistics import Interval
 from facediff.utils.files import atomic
 from facediff.utils.plain_files import write_rows
@@ -50,13 +47,13 @@ def write_report(report: BenchmarkReport, folder: Path) -> list[Path]:
     if not report.tables:
         reason = f"; the first problem: {report.failed[0]}" if report.failed else ""
         raise FaceDiffError(f"{report.outline.name}: no cell has a result yet{reason}; run `facediff benchmark` first")
-    name, drawings = report.outline.name, plots(report)
+    name, blocks = report.outline.name, document(report)
     texts = {
-        f"{name}.md": markdown(document(report)),
+        f"{name}.md": markdown(blocks),
         f"{name}.tex": latex_tables(report),
-        f"{name}.html": html_page(report.outline.title, document(report, drawings)),
+        f"{name}.html": html_page(report.outline.title, blocks),
     }
-    files = write_texts(folder, texts | {f"{name}_{plot}.svg": drawing.svg for plot, drawing in drawings.items()})
+    files = write_texts(folder, texts)
     write_rows(folder / f"{name}.csv", csv_rows(report))
     return [*files, folder / f"{name}.csv"]
 
@@ -159,22 +156,22 @@ def mean_and_deviation(row: TableRow, column: str, scale: Scale) -> str:
 # The blocks of a report.
 
 
-def document(report: BenchmarkReport, drawings: Mapping[str, Drawing] | None = None) -> list[Block]:
-    """The whole report, with the plots of :func:`plots` below their tables."""
+def document(report: BenchmarkReport) -> list[Block]:
+    """The whole report."""
     outline = report.outline
     return [
         Title(outline.title),
         *([Paragraph(outline.description)] if outline.description else []),
-        *body(report, drawings or {}),
+        *body(report),
     ]
 
 
-def body(report: BenchmarkReport, drawings: Mapping[str, Drawing]) -> list[Block]:
+def body(report: BenchmarkReport) -> list[Block]:
     """The report without its title."""
     blocks: list[Block] = []
     if any(table.synthetic for table in report.tables):
         blocks.append(Paragraph("Synthetic data: these results are not about real people.", warning=True))
-    for number, table in enumerate(report.tables):
+    for table in report.tables:
         facts = f"{table.frames} frames, {table.sequences} sentences"
         regions = [
             f"{part} {facts_of_part['count']} vertices (hash {facts_of_part['hash']})"
@@ -184,7 +181,6 @@ def body(report: BenchmarkReport, drawings: Mapping[str, Drawing]) -> list[Block
         notes = [f"{facts}; {', '.join(regions)}" if regions else facts, *table.notes]
         notes += [f"printed figures: {source}" for source in table.published.sources] + list(table.published.reasons)
         blocks += [Title(table.title, 2), main_table(table, printed=True), *details(table, report), Bullets(notes)]
-        blocks += [drawing for name, drawing in drawings.items() if name.startswith(f"{number}_")]
     definitions = [line.strip() for line in report.definition.splitlines() if line.strip()]
     return [*blocks, Title("Definitions", 2), Bullets(about(report)), Bullets(definitions)]
 
@@ -281,8 +277,6 @@ def about(report: BenchmarkReport) -> list[str]:
             f"training and test; on {'; '.join(sorted(machines))}"
         )
     lines += report.remarks
-    if not has_matplotlib():
-        lines.append("plots are left out: matplotlib is not installed; `pip install 'facediff[figures]'`, write again")
     lines += [f"no result yet: {name}" for name in report.pending]
     lines += [f"failed: {problem}" for problem in report.failed]
     codes = sorted({" ".join(result.code.values()) for result in report.results if result.code})
@@ -315,7 +309,7 @@ def replace_block(path: Path, report: BenchmarkReport) -> None:
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(end) < text.index(begin):
         raise FaceDiffError(f"{path}: has no block for {name}; add the two lines  {begin}  and  {end}  to the page")
     # Headings of the page are one level above the tables'.
-    blocks = body(report, {})
+    blocks = body(report)
     lowered = [replace(block, level=block.level + 1) if isinstance(block, Title) else block for block in blocks]
     block = f"{begin}\n\n{markdown(lowered)}\n".replace("\n", "\r\n" if "\r\n" in text else "\n")
     with atomic(path) as temporary:
@@ -366,17 +360,6 @@ def _csv_row(report: BenchmarkReport, table: Table, row: TableRow, column: str, 
         **{"frames": table.frames, "sentences": row.clips, "parameters": row.cost.parameters},
         **{"real_time_factor": row.cost.factor, "training_seconds": row.cost.training},
         "memory_bytes": row.cost.memory,
-    }
-
-
-def plots(report: BenchmarkReport) -> dict[str, Drawing]:
-    """The plots of all tables by number of the table, corpus, split and name; none without matplotlib."""
-    if not has_matplotlib():
-        return {}
-    return {
-        f"{number}_{table.corpus}_{table.split}_{name}": drawing
-        for number, table in enumerate(report.tables)
-        for name, drawing in plots_of(table, report).items()
     }
 
 

@@ -83,11 +83,9 @@ COMMANDS = {
     "predict": Command("facediff.cli.lightning:lightning", "write a model's motion for a split"),
     "evaluate": Command("facediff.cli.evaluate:evaluate", "score predicted motion files by named protocols"),
     "benchmark": Command(
-        "facediff.cli.benchmark:benchmark", "train and score many methods, and write the tables", "train,figures"
+        "facediff.cli.benchmark:benchmark", "train and score many methods, and write the tables", "train"
     ),
-    "benchmark report": Command(
-        "facediff.cli.benchmark:report", "write the tables of benchmarks again", "train,figures"
-    ),
+    "benchmark report": Command("facediff.cli.benchmark:report", "write the tables of benchmarks again", "train"),
     "benchmark referee": Command(
         "facediff.cli.referee:referee",
         "compare models of any kind on one face, by phonemes",
@@ -130,7 +128,7 @@ COMMANDS = {
 HELP = ("-h", "--help")
 GROUPS = {
     "style": "speaking styles of trained models",
-    "figure": "draw the figures of a paper: faces, heat maps, lip and training curves",
+    "figure": "draw the figures of a paper: faces, heat maps and lip curves",
     "study": "user studies: make, serve, report",
     "data": "track faces in videos; align recordings; prepare, check and pack corpora",
 }

@@ -107,7 +107,7 @@ def report(
     seed: Seed = 0,
     page: Annotated[Path | None, Option(metavar="FILE", writes="file")] = None,
 ) -> None:
-    """Write the tables of benchmarks again: Markdown, LaTeX, CSV, a page for the browser, and plots.
+    """Write the tables of benchmarks again: Markdown, LaTeX, CSV, and a page for the browser.
 
     They are in report/ of each folder, unless --output says otherwise. Nothing is trained or tested; cells that are not
     done yet are named.

@@ -96,8 +96,7 @@ class PageOptions:
 
     def paper(self) -> Paper:
         """The page; matplotlib must be there."""
-        from facediff.evaluation.figures import Paper
-        from facediff.reporting.drawing import matplotlib
+        from facediff.evaluation.figures.page import Paper, matplotlib
 
         matplotlib()
         return Paper(self.width, self.dpi, self.font)

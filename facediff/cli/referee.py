@@ -106,9 +106,9 @@ def judged(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None
         return Judgement(candidate.name, problem="killed its process, perhaps for lack of memory")
     if isinstance(motion, str):
         return Judgement(candidate.name, problem=motion)
-    scores, faults, openings = judge(clips, motion.clips, motion.frame_rate, motion.jaw)
+    scores, faults = judge(clips, motion.clips, motion.frame_rate, motion.jaw)
     facts = {"put on the face": motion.way, "licence": motion.licence, "commercial use": motion.commercial_use}
-    return Judgement(candidate.name, scores, faults, facts, motion.seconds, motion.memory, motion.frame_rate, openings)
+    return Judgement(candidate.name, scores, faults, facts, motion.seconds, motion.memory, motion.frame_rate)
 
 
 def candidates_of(

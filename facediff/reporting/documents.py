@@ -31,8 +31,7 @@ th, td { padding: 0.2rem 0.7rem; text-align: right; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; white-space: normal; }
 thead th { border-top: 2px solid; border-bottom: 1px solid; } tbody tr:last-child td { border-bottom: 2px solid; }
 .best { font-weight: bold; } .second { text-decoration: underline; } .reference { font-style: italic; color: #444; }
-.scroll { overflow-x: auto; } figure { display: inline-block; margin: 0 1rem 1rem 0; } figcaption { font-size: 13px; }
-svg { max-width: 100%; height: auto; background: #fff; }
+.scroll { overflow-x: auto; }
 .warning { border: 1px solid #b55; padding: 0.4rem 0.8rem; display: inline-block; }
 @media (prefers-color-scheme: dark) { body { background: #16181c; color: #e6e6e6; } .reference { color: #bbb; } }
 """
@@ -59,14 +58,6 @@ class Bullets:
     """Lines one below the other."""
 
     lines: Sequence[str]
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A plot as SVG, with its caption. Only a page for the browser shows it."""
-
-    svg: str
-    caption: str
 
 
 @dataclass(frozen=True)
@@ -99,7 +90,7 @@ class ReportTable:
         ]
 
 
-Block = Title | Paragraph | Bullets | Drawing | ReportTable
+Block = Title | Paragraph | Bullets | ReportTable
 
 
 def between(low: float, high: float, show: Callable[[float], str]) -> str:
@@ -124,8 +115,8 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
 
 
 def markdown(blocks: Iterable[Block]) -> str:
-    """A document in Markdown, without its plots."""
-    return "\n\n".join(_markdown(block) for block in blocks if not isinstance(block, Drawing)) + "\n"
+    """A document in Markdown."""
+    return "\n\n".join(map(_markdown, blocks)) + "\n"
 
 
 def _markdown(block: Block) -> str:
@@ -142,8 +133,6 @@ def _markdown(block: Block) -> str:
             for index in block.references:
                 rows[index][0] = f"*{rows[index][0]}*"
             return _markdown_lines([markdown_text(title) for title in block.head], rows)
-        case Drawing():
-            return ""
 
 
 def _markdown_lines(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -224,7 +213,7 @@ def latex_text(text: object) -> str:
 
 
 def html_page(title: str, blocks: Iterable[Block]) -> str:
-    """A document as one file that loads nothing; plots that follow each other stand side by side."""
+    """A document as one file that loads nothing."""
     # Names of methods come from elsewhere: even if one were not escaped, no program and no address would be used.
     policy = "default-src 'none'; style-src 'unsafe-inline'"
     head = (
@@ -243,8 +232,6 @@ def _html(block: Block) -> str:
             return f"<p{_css('warning' if block.warning else '')}>{html_text(block.text)}</p>"
         case Bullets():
             return f"<ul>{''.join(f'<li>{html_text(line)}</li>' for line in block.lines)}</ul>"
-        case Drawing():
-            return f"<figure>{block.svg}<figcaption>{html_text(block.caption)}</figcaption></figure>"
         case ReportTable():
             return _html_table(block)
 
@@ -278,7 +265,7 @@ def html_text(text: object) -> str:
 
 
 def terminal_text(blocks: Iterable[Block]) -> str:
-    """A document as text for the terminal, without its plots; a blank line ends every block but a title."""
+    """A document as text for the terminal; a blank line ends every block but a title."""
     lines: list[str] = []
     for block in blocks:
         match block:

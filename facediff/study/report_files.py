@@ -10,13 +10,11 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from facediff.errors import printable
 from facediff.reporting.documents import (
     Block,
     Bullets,
-    Drawing,
     Paragraph,
     ReportTable,
     Title,
@@ -28,13 +26,9 @@ from facediff.reporting.documents import (
     terminal_text,
     write_texts,
 )
-from facediff.reporting.drawing import GREY, LONGEST_LABEL, has_matplotlib, plain, plot_svg
 from facediff.study.analysis import Preference, StudyReport, answers_of
 from facediff.study.definition import SAME
 from facediff.utils.plain_files import json_text, write_rows
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Cells = list[list[str | None]]
 
@@ -49,7 +43,7 @@ def write_report(reports: Sequence[StudyReport], folder: Path) -> list[Path]:
         folder,
         {
             "report.md": markdown(blocks(reports)),
-            "report.html": html_page("User study", blocks(reports, with_plots=True)),
+            "report.html": html_page("User study", blocks(reports)),
             "table.tex": latex(main_table(reports, question) for question in questions(reports)),
             "report.json": json_text("report.json", {"studies": [report.as_dict() for report in reports]}) + "\n",
         },
@@ -147,14 +141,13 @@ def facts(report: StudyReport) -> list[str]:
     return [*lines, *report.notes]
 
 
-def blocks(reports: Sequence[StudyReport], *, with_plots: bool = False) -> list[Block]:
-    """The whole report, with its plots if they are to be drawn."""
+def blocks(reports: Sequence[StudyReport]) -> list[Block]:
+    """The whole report."""
     document: list[Block] = [Title("User study")]
     for question in questions(reports):
         document += [Title(question, 2), main_table(reports, question)]
         for report in reports:
-            document += [Title(f"{question}: {report.name}", 3), *(plots(report, question) if with_plots else [])]
-            document += [pair_table(report, question)]
+            document += [Title(f"{question}: {report.name}", 3), pair_table(report, question)]
     for report in reports:
         document += [Title(f"Raters: {report.name}", 2), rater_table(report), Bullets(facts(report))]
     return document
@@ -167,26 +160,6 @@ def text(report: StudyReport) -> str:
     for question in questions([report]):
         document += [Title(question, 2), pair_table(report, question)]
     return terminal_text([*document, rater_table(report), Bullets(facts(report))])
-
-
-def plots(report: StudyReport, question: str) -> list[Drawing]:
-    """Shares with their intervals; no plot without matplotlib."""
-    rows = [preference for preference in report.preferences if preference.question == question]
-    label = printable(f"Share of the first of each pair, with its interval: {question}, {report.name}")
-
-    def draw(axes: Axes) -> None:
-        for y, row in enumerate(rows):
-            axes.plot(row.interval, [y, y], color="#0b7285", linewidth=2)
-            axes.plot(row.share, y, "o", color="#0b7285", markersize=5)
-        axes.axvline(0.5, color=GREY, linewidth=0.8, zorder=0)
-        axes.set_xlim(0, 1)
-        axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0 %", "25 %", "50 %", "75 %", "100 %"])
-        names = [plain(printable(f"{row.first} and {row.second}")) for row in rows]
-        axes.set_yticks(range(len(rows)), [name[:LONGEST_LABEL] for name in names])
-        axes.set_ylim(len(rows) - 0.5, -0.5)
-
-    height = 0.5 + 0.27 * len(rows)
-    return [Drawing(plot_svg(draw, label, width=7.5, height=height), label)] if has_matplotlib() else []
 
 
 # Plain data.

@@ -74,7 +74,6 @@ def test_every_cell_is_trained_and_tested_once_with_its_seed(folder: Path) -> No
     assert run(folder) == []
     (result,) = (read_result(cell_file(folder / "out", cell)) for cell in cells_of(read_plan(folder / "plan.yaml"))[:1])
     assert result is not None
-    assert list(result.curve["val/lve"]) == [2.0, 1.0]
     assert result.measured["fit"]["memory"]
 
 

@@ -23,7 +23,6 @@ from facediff.benchmark.writing import (
     Scale,
     document,
     latex_tables,
-    plots,
     replace_block,
     text,
     write_report,
@@ -116,7 +115,7 @@ def test_a_method_that_ignores_its_speech_is_named() -> None:
 def test_all_forms_are_written_and_hold_the_same_numbers(tmp_path: Path) -> None:
     report = made()
     files = write_report(report, tmp_path)
-    assert {path.suffix for path in files} == {".md", ".tex", ".html", ".csv", ".svg"}
+    assert {path.suffix for path in files} == {".md", ".tex", ".html", ".csv"}
     mean = report.tables[0].row("method_0").scores["lve"].mean
     with (tmp_path / "made.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -161,7 +160,7 @@ def test_the_page_needs_no_network_and_shows_hostile_names_as_they_are() -> None
             assert tag != "script"
             assert not any(name in ("src", "href") or name.startswith("on") for name, _ in attrs)
 
-    whole = html_page(evil, document(report, plots(report)))
+    whole = html_page(evil, document(report))
     Tags().feed(whole)
     assert not re.search("https?:", re.sub(r"http://www\.w3\.org/(2000/svg|1999/xlink)", "", whole))
     assert r"\textbackslash{}input\{x\}" in latex_tables(report)
@@ -203,13 +202,6 @@ def test_the_command_writes_a_report_from_results_alone(tmp_path: Path, capsys: 
     assert "nobody" in capsys.readouterr().err
     assert main(["benchmark", "report", str(tmp_path / "none")]) == 2
     assert str(tmp_path / "none") in capsys.readouterr().err
-
-
-def test_without_matplotlib_the_report_says_so_and_has_no_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("facediff.benchmark.writing.has_matplotlib", lambda: False)
-    report = made()
-    assert {path.suffix for path in write_report(report, tmp_path)} == {".md", ".tex", ".html", ".csv"}
-    assert "matplotlib" in (tmp_path / "made.md").read_text()
 
 
 @pytest.mark.parametrize(

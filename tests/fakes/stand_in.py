@@ -32,7 +32,6 @@ def main() -> None:
         if options.get("trainer.enable_checkpointing") == "false":
             return
         last.write_text(json.dumps({"seed": options["seed_everything"], "dim": options.get("model.dim", "0")}))
-        (place / "metrics.csv").write_text("step,epoch,val/lve\n9,0,2.0\n19,1,1.0\n")
         if "STAND_IN_WAITS" in os.environ:
             time.sleep(600)
         return

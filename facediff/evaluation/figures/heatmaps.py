@@ -9,8 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from facediff.evaluation.figures.material import FLAT, Array, FigureData, Painter, chunks, shortest
-from facediff.evaluation.figures.page import GAP, Grid, Heading, Paper, check_output, save, style, wrapped
-from facediff.reporting.drawing import SMALLEST_TEXT, plain
+from facediff.evaluation.figures.page import (
+    GAP,
+    SMALLEST_TEXT,
+    Grid,
+    Heading,
+    Paper,
+    check_output,
+    plain,
+    save,
+    style,
+    wrapped,
+)
 from facediff.utils import ranges
 
 HIGHEST = 70.0  # Largest height of a picture in mm

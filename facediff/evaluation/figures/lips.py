@@ -16,18 +16,21 @@ from facediff.evaluation.figures.material import TRUTH, Array, FigureData, chunk
 from facediff.evaluation.figures.page import (
     BLACK,
     FAINT,
+    GREY,
     PANEL_HEIGHT,
+    SMALLEST_TEXT,
     Paper,
     check_output,
     legend_columns,
+    line_style,
     new_figure,
+    plain,
     save,
     style,
     text_width,
 )
 from facediff.metrics import LipPairs
 from facediff.metrics.mouth import opening
-from facediff.reporting.drawing import GREY, SMALLEST_TEXT, line_style, plain
 from facediff.speech.phonemes import TimedPhoneme, closed_times
 from facediff.utils import SAMPLE_RATE, ranges
 

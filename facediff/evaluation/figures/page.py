@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import check_known
-from facediff.reporting.drawing import FONT, GREY, SMALLEST_TEXT, TEXT, drawing_settings, matplotlib, plain
+from facediff.errors import check_known, needs_extra
 from facediff.utils import ranges
 from facediff.utils.files import atomic, check_writable
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -31,8 +33,21 @@ DATES: dict[str, dict[str, Any]] = {
 """Formats by suffix, with the metadata that would differ between equal figures."""
 COLUMN, PAGE = 85.0, 175.0  # Widths in mm of a column and of a page of the usual journals
 POINTS_PER_MM = 72 / 25.4
+SMALLEST_TEXT, TEXT = 7.0, 8.0  # Sizes of letters in points
+FONT = "DejaVu Sans"
+"""The font that comes with matplotlib: it has the letters of the IPA, and is the same on every machine."""
 
-BLACK, FAINT = "#000000", "#BFBFBF"
+BLACK, GREY, FAINT = "#000000", "#595959", "#BFBFBF"
+# Okabe and Ito's colours (2008), without black, which is the truth's, and yellow, which is too faint for lines.
+LINES: tuple[tuple[str, Any], ...] = (
+    ("#0072B2", "-"),
+    ("#D55E00", (0, (5, 1.5))),
+    ("#009E73", (0, (1.2, 1.2))),
+    ("#CC79A7", (0, (5, 1.5, 1.2, 1.5))),
+    ("#E69F00", (0, (3, 1))),
+    ("#56B4E9", (0, (8, 1.5, 1.2, 1.5, 1.2, 1.5))),
+)
+"""Colour and dashes of each method's line, so that lines differ without colours too."""
 PANEL_HEIGHT = 42.0  # Height in mm of axes with curves
 GAP = 1.0  # Millimetres between pictures, and between pictures and labels
 NAME_LINES = 2  # The most lines of a row's name
@@ -60,16 +75,56 @@ def check_output(path: Path) -> None:
     check_writable(path)
 
 
+def matplotlib() -> ModuleType:
+    """The package matplotlib."""
+    with needs_extra("matplotlib", "figures", "drawing figures"):
+        import matplotlib as package
+        import matplotlib.backends.backend_agg
+        import matplotlib.figure
+        import matplotlib.font_manager  # noqa: F401
+    return package
+
+
 @contextmanager
 def style(paper: Paper) -> Iterator[None]:
     """Settings of matplotlib for drawing and saving a figure; the caller's own are restored afterwards."""
-    matplotlib()
-    from matplotlib import font_manager
-
-    fonts = sorted(set(font_manager.get_font_names()))
-    check_known("--font", "font", [paper.font], fonts)
-    with drawing_settings(paper.font):
+    package = matplotlib()
+    check_known("--font", "font", [paper.font], sorted(set(package.font_manager.get_font_names())))
+    settings = {
+        "font.family": [paper.font],
+        "font.size": TEXT,
+        "axes.labelsize": TEXT,
+        "axes.titlesize": TEXT,
+        "xtick.labelsize": SMALLEST_TEXT,
+        "ytick.labelsize": SMALLEST_TEXT,
+        "legend.fontsize": TEXT,
+        "legend.frameon": False,
+        "legend.handlelength": 2.6,
+        "axes.linewidth": 0.6,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.formatter.use_mathtext": False,
+        "pdf.fonttype": 42,
+        "svg.fonttype": "none",
+        "svg.hashsalt": "facediff",
+    }
+    with package.rc_context(), warnings.catch_warnings():
+        package.rcdefaults()  # a matplotlibrc of the user's must not change the figure
+        package.rcParams.update(settings)
         yield
+
+
+def line_style(number: int) -> dict[str, Any]:
+    """Colour, dashes and width of a method's line, as matplotlib's options."""
+    colour, dashes = LINES[number % len(LINES)]
+    return {"color": colour, "linestyle": dashes, "linewidth": 1.1 if number < len(LINES) else 0.7}
+
+
+def plain(text: str) -> str:
+    """Text in which matplotlib sees no formula, nor a name that legends leave out: one that begins with "_"."""
+    return f"{' ' * text.startswith('_')}{text}".replace("$", r"\$")
 
 
 def new_figure(paper: Paper, height: float, **options: object) -> Figure:

@@ -28,13 +28,12 @@ from facediff.evaluation.figures import (
 )
 from facediff.evaluation.figures import lips as lips_module
 from facediff.evaluation.figures.material import FLAT, Painter
-from facediff.evaluation.figures.page import Grid, Heading
+from facediff.evaluation.figures.page import SMALLEST_TEXT, Grid, Heading
 from facediff.render.panels import heat_ramp
-from facediff.reporting.drawing import SMALLEST_TEXT
 
 SMALL = Paper(width=85, dpi=100)
 TIMES = (np.arange(50) + 0.5) / 25
-LIPS = Curves(TIMES, {"truth": np.sin(TIMES) ** 2, "ours": np.cos(TIMES) ** 2, "th$irs": np.abs(np.sin(3 * TIMES))})
+LIPS = Curves(TIMES, {"truth": np.sin(TIMES) ** 2, "ours": np.cos(TIMES) ** 2, "_th$irs": np.abs(np.sin(3 * TIMES))})
 SPEECH = np.sin(np.arange(32_000) / 20).astype("f4")
 PHONEMES = [
     TimedPhoneme(0, 0.2, ""),
@@ -57,7 +56,7 @@ def draw(name: str, material: FigureData, path: Path) -> None:
 TEXTS = {
     "frames": ["truth", "ours", "theirs", "/m/", "0.10 s", "0.50 s", "tiny: synthetic corpus"],
     "heatmap": ["truth", "ours", "theirs", "mean of motion [mm]", "std of motion [mm]", "tiny: synthetic corpus"],
-    "lips": ["truth", "ours", "th$irs", "lip opening [mm]", "time [s]", "m", "ɑː", "ʃ", "/p/, /b/, /m/", "sound"],
+    "lips": ["truth", "ours", "_th$irs", "lip opening [mm]", "time [s]", "m", "ɑː", "ʃ", "/p/, /b/, /m/", "sound"],
 }
 
 
