@@ -28,7 +28,7 @@ def test_the_bundled_model_is_judged_and_a_missing_motion_is_reported(
     assert all(report["rows"][0]["sees"].values())
     with (tmp_path / "out" / "referee.csv").open(newline="") as stream:
         assert [row["fault"] for row in csv.DictReader(stream)] == ["", "delay", "muted", "jitter", "sentence", ""]
-    assert "<svg" in (tmp_path / "out" / "referee.html").read_text()
+    assert "<td>puppet</td>" in (tmp_path / "out" / "referee.html").read_text()
     assert "| puppet |" in (tmp_path / "out" / "referee.md").read_text()
 
 
