@@ -231,9 +231,6 @@ def pack(
     tolerance: Annotated[ranges.Millimetres, Option(metavar="MM")] = 0.01,
     lossless: bool = False,
     exact: Literal["test", "none"] = "test",
-    unit: Annotated[str | None, Option(metavar="U")] = None,
-    chunk_seconds: Annotated[ranges.ChunkLength, Option(metavar="S")] = 0.5,
-    codec: Literal["zstd", "lz4"] = "zstd",
     work: WorkOptions,
 ) -> None:
     """Pack a corpus into one Zarr store, at most a fifth of its size, that can also be read from an address.
@@ -248,10 +245,6 @@ def pack(
         tolerance: by how many millimetres a stored coordinate may differ, at most
         lossless: keep the motion bit for bit, at about half its size
         exact: keep test clips and their style references bit for bit, so that scores stay the same; or none
-        unit: the corpus's unit of length, m, cm, mm, in, or a number of metres (default: by its manifest.json, or
-            the corpus's own)
-        chunk_seconds: motion is read in pieces of this length
-        codec: how motion is compressed; lz4 is read faster and takes an eighth more room
         work: where the work is done
     """
     from facediff.data.packed.packing import pack as pack_folder
@@ -259,22 +252,12 @@ def pack(
     find_own_module(corpus)
     with resumable(out):
         report = pack_folder(
-            root,
-            out,
-            corpus=corpus,
-            tolerance=tolerance,
-            lossless=lossless,
-            exact=exact,
-            unit=unit,
-            chunk_seconds=chunk_seconds,
-            codec=codec,
-            **vars(work),
+            root, out, corpus=corpus, tolerance=tolerance, lossless=lossless, exact=exact, **vars(work)
         )
     left_out = [f"note: left out, since it belongs to no clip: {name}" for name in report.left_out]
     tell(
         f"{out}: {counted(report.clips, 'clip')}, {report.seconds / 60:.1f} min, {report.after / 1e9:.3g} GB "
-        f"of {report.before / 1e9:.3g} GB, {report.gb_an_hour:.2f} GB an hour; "
-        f"{counted(report.written, 'shard')} written now",
+        f"of {report.before / 1e9:.3g} GB; {counted(report.written, 'shard')} written now",
         *shortened(left_out, "note: … and {} more"),
         f"Next: facediff data check {out}",
     )

@@ -17,7 +17,6 @@ BlinkRate = Annotated[float, Range(1, 40)]
 USUAL_BLINKS = 17.0
 """Blinks a minute of a person at rest, where no number is given."""
 Bound = Annotated[float, Range(-1000, 1000)]
-ChunkLength = Annotated[float, Range(0.01, 60)]
 ClipLength = Annotated[float, Range(1, 600)]
 Duration = Annotated[float, Range(0.001, 604_800)]
 """Seconds that something lasts; a week at most."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections import OrderedDict
 from threading import Lock
 from typing import Any
 
 import numpy.typing as npt
 
-VARIABLE = "FACEDIFF_PACKED_MEMORY_GB"
-USUAL_GB = 0.5
-"""Default size of the cache in gigabytes, of all loader processes together."""
+from facediff.utils.ranges import Range
+
+VARIABLE, USUAL_GB = "FACEDIFF_PACKED_MEMORY_GB", 0.5
+"""Size of the cache in gigabytes, of all loader processes together: the variable that sets it, and its default."""
 
 Key = tuple[str, int]
 """Array and chunk."""
@@ -23,11 +25,12 @@ class DecodedChunks:
     on a corpus larger than the cache: its chunks would be replaced before they are used again.
 
     Args:
-        limit: bytes.
+        limit: bytes; those that the environment names if None.
     """
 
-    def __init__(self, limit: float) -> None:
-        self.limit = limit
+    def __init__(self, limit: float | None = None) -> None:
+        usual = 1e9 * Range(0, 1e9).read(VARIABLE, os.environ.get(VARIABLE, str(USUAL_GB)))
+        self.limit = usual if limit is None else limit
         self._reset()
 
     def _reset(self) -> None:

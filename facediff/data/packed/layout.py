@@ -11,8 +11,8 @@ A packed corpus is a Zarr (version 3) group. Its attribute ``facediff`` is the r
 - ``speech``, (bytes,): FLAC streams of at most ten seconds, so that a window of a long recording is decoded alone.
 - ``files``, (bytes,): every other file of the corpus folder as it was.
 
-All are sharded, and their chunks are compressed by Blosc (zstd, or for motion lz4, after a bit shuffle) and end in a
-CRC-32C: ordinary codecs of Zarr, so that any of its implementations reads them.
+All are sharded, and their chunks are compressed by Blosc (zstd after a bit shuffle; motion of 1.1 also by lz4) and end
+in a CRC-32C: ordinary codecs of Zarr, so that any of its implementations reads them.
 """
 
 from __future__ import annotations
@@ -55,16 +55,12 @@ SHARD_BYTES = 64 << 20
 BLOB_CHUNK = 1 << 16
 """Bytes of a chunk of speech and files."""
 BLOB_SHARD = 1 << 25
+CHUNK_SECONDS = 0.5
+"""Length of the pieces in which motion is read."""
 PIECE_SECONDS = 10
 """Seconds of a FLAC stream."""
 MARGIN = 0.99
 """Share of the tolerance for quantisation; the rest is for the rounding of vertices to single precision."""
-
-Codec = Literal["zstd", "lz4"]
-CODECS: dict[Codec, tuple[Literal["zstd", "lz4hc"], int]] = {"zstd": ("zstd", 5), "lz4": ("lz4hc", 3)}
-"""Blosc's codec for motion, and its level, by the name that the user chooses.
-
-What lz4 writes is decoded in two thirds of the time and takes an eighth more room; higher levels change neither."""
 
 REMEDY = "get the packed corpus again, or pack it again"
 DAMAGED = "the packed corpus is damaged, " + REMEDY
@@ -177,7 +173,6 @@ class Record:
         clips: every clip, by name.
         files: every other file, by path.
         arrays: the arrays, by name.
-        codec: of the motion; ``zstd`` in a record that does not name it.
     """
 
     made_by: Name
@@ -192,7 +187,6 @@ class Record:
     clips: Mapping[str, PackedClip] = field(default_factory=dict)
     files: Mapping[str, PackedFile] = field(default_factory=dict)
     arrays: Mapping[str, ArrayInfo] = field(default_factory=dict)
-    codec: Codec = "zstd"
 
     @classmethod
     def read(cls, text: bytes, source: str) -> Record:

@@ -21,7 +21,7 @@ from facediff.data.manifest import read_manifest
 from facediff.data.packed.layout import (
     BLOB_CHUNK,
     BLOB_SHARD,
-    CODECS,
+    CHUNK_SECONDS,
     CODINGS,
     METADATA,
     PIECE_SECONDS,
@@ -32,7 +32,6 @@ from facediff.data.packed.layout import (
     SHARD_BYTES,
     STATE,
     ArrayInfo,
-    Codec,
     Coding,
     ExactCoding,
     PackedClip,
@@ -77,65 +76,34 @@ REMEDY = "run `facediff data check` on the folder, and correct or remove the cli
 
 @dataclass(frozen=True)
 class PackingReport:
-    """The outcome of packing.
+    """The outcome of packing."""
 
-    Attributes:
-        out: the packed corpus.
-        clips: number of clips.
-        seconds: of motion.
-        before: bytes of the folder's motion and speech.
-        after: bytes of the packed corpus.
-        written: shards written by this run.
-        left_out: files that belong to no clip: motion without speech, or speech without motion.
-    """
-
-    out: Path
     clips: int
-    seconds: float
-    before: int
-    after: int
-    written: int
-    left_out: tuple[str, ...]
-
-    @property
-    def gb_an_hour(self) -> float:
-        """Gigabytes of the packed corpus for an hour of motion."""
-        return self.after / 1e9 / max(self.seconds / 3600, 1e-9)
+    seconds: float  # of motion
+    before: int  # bytes of the folder's motion and speech
+    after: int  # bytes of the packed corpus
+    written: int  # shards written by this run
+    left_out: tuple[str, ...]  # files that belong to no clip: motion without speech, or speech without motion
 
 
 @dataclass(frozen=True)
 class ShardPart:
-    """Frames of a clip that lie in a shard.
+    """Frames of a clip that lie in a shard."""
 
-    Attributes:
-        path: the clip's motion.
-        identity: speaker of the subtracted template.
-        row: the first row in the shard.
-        start: the first frame.
-        stop: the frame after the last one.
-    """
-
-    path: Path
-    identity: str
-    row: int
+    path: Path  # the clip's motion
+    identity: str  # speaker of the subtracted template
+    row: int  # the first row in the shard
     start: int
     stop: int
 
 
 @dataclass(frozen=True)
 class PackingTask:
-    """One file to write: a shard of motion, or the encoded speech of a clip.
+    """One file to write: a shard of motion, or the encoded speech of a clip."""
 
-    Attributes:
-        target: path below the store.
-        coding: of the motion; empty for speech.
-        parts: of the shard.
-        sound: the recording.
-    """
-
-    target: str
-    coding: str = ""
-    parts: tuple[ShardPart, ...] = ()
+    target: str  # path below the store
+    coding: str = ""  # of the motion; empty for speech
+    parts: tuple[ShardPart, ...] = ()  # of the shard
     sound: Path | None = None
 
     def __str__(self) -> str:
@@ -151,9 +119,6 @@ def pack(
     tolerance: Annotated[float, Range(FINEST, 1000)] = 0.01,
     lossless: bool = False,
     exact: Exact = "test",
-    unit: str | None = None,
-    chunk_seconds: float = 0.5,
-    codec: Codec = "zstd",
     workers: int | None = None,
     scheduler: str | None = "",
     quiet: bool = True,
@@ -171,9 +136,6 @@ def pack(
         lossless: keep every bit of the motion.
         exact: which clips keep every bit all the same: ``test`` for the test splits and the style references of their
             clips, so that scores do not change; or ``none``.
-        unit: the corpus's unit of length; from its manifest or its data module if None.
-        chunk_seconds: length of the pieces in which motion is read.
-        codec: of the motion: ``zstd``, or ``lz4``, which is larger and read faster.
         workers: processes; as many as there are processors if None.
         scheduler: where tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
         quiet: no progress bar.
@@ -182,7 +144,7 @@ def pack(
         raise FaceDiffError(f"{out}: lies in the corpus folder {root}; choose a folder outside it")
     with needs_extra("zarr", "packed", "packing a corpus"):
         import zarr  # noqa: F401
-    plan = PackingPlan.of(root, corpus, 0.0 if lossless else tolerance, unit, chunk_seconds, exact, codec)
+    plan = PackingPlan.of(root, corpus, 0.0 if lossless else tolerance, exact)
     check_writable(out / STATE)
     with locked(out / LOCK, "facediff data pack"):
         return _carry_out(plan, out, workers, scheduler, quiet)
@@ -190,44 +152,26 @@ def pack(
 
 @dataclass(frozen=True)
 class PackingPlan:
-    """The contents of a packed corpus, from the headers of all files.
+    """The contents of a packed corpus, from the headers of all files."""
 
-    Attributes:
-        root: the corpus folder.
-        record: without the shards' sizes, the speech and the files.
-        files: other files of the folder, by path below it.
-        left_out: files of motion or speech that no clip has.
-        sources: size and time of every file that is packed; a resumed run must find the same.
-        bytes: of motion and speech.
-    """
-
-    root: Path
-    record: Record
-    files: tuple[str, ...]
-    left_out: tuple[str, ...]
-    sources: str
-    bytes: int
+    root: Path  # the corpus folder
+    record: Record  # without the shards' sizes, the speech and the files
+    files: tuple[str, ...]  # other files of the folder, by path below it
+    left_out: tuple[str, ...]  # files of motion or speech that no clip has
+    sources: str  # hash of size and time of every file that is packed; a resumed run must find the same
+    bytes: int  # of motion and speech
 
     @classmethod
-    def of(
-        cls,
-        root: Path,
-        corpus: str | None,
-        tolerance: float,
-        unit: str | None,
-        chunk_seconds: float,
-        exact: Exact,
-        codec: Codec,
-    ) -> PackingPlan:
+    def of(cls, root: Path, corpus: str | None, tolerance: float, exact: Exact) -> PackingPlan:
         """Scan a corpus folder."""
         from facediff.data.check.layouts import view_of
 
         view = view_of(root, corpus)
         manifest = read_manifest(root)
-        unit = unit or str(manifest.get("unit") or view.unit)
+        unit = str(manifest.get("unit") or view.unit)
         millimetres = 1000.0 * metres_per_unit(unit) if tolerance else 1.0
         rate = float(manifest.get("frame_rate") or view.stored_frame_rate)
-        chunk = chunk_frames(rate, chunk_seconds)
+        chunk = chunk_frames(rate, CHUNK_SECONDS)
         step = step_of(tolerance, unit)
         quantised: Coding = "int16" if step * millimetres * np.iinfo(np.int16).max >= ROOM else "int32"
         templates = read_templates(root / "templates.pkl", view.n_vertices)
@@ -282,23 +226,19 @@ class PackingPlan:
             tolerance=tolerance,
             step=step,
             unit=unit,
-            chunk_seconds=chunk_seconds,
+            chunk_seconds=CHUNK_SECONDS,
             identities=tuple(sorted(templates)),
             clips=clips,
             arrays=arrays,
-            codec=codec,
         )
         return cls(root, record, _other_files(root), tuple(left_out), sources.hexdigest(), size)
 
     @property
     def recipe(self) -> dict[str, Any]:
         """All that determines the output; a run may be resumed only with the same."""
-        record = self.record
-        return {
-            **{name: getattr(record, name) for name in ("made_by", "corpus", "n_vertices", "frame_rate")},
-            **{name: getattr(record, name) for name in ("tolerance", "unit", "chunk_seconds", "codec")},
-            "clips": {name: [clip.coding, clip.frames] for name, clip in record.clips.items()},
-        }
+        names = ("made_by", "corpus", "n_vertices", "frame_rate", "tolerance", "unit", "chunk_seconds")
+        clips = {name: [clip.coding, clip.frames] for name, clip in self.record.clips.items()}
+        return {**{name: getattr(self.record, name) for name in names}, "clips": clips}
 
     def tasks(self) -> Iterator[PackingTask]:
         """A task for every shard of motion, and for every clip's speech."""
@@ -360,7 +300,7 @@ def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str
     options = {"workers": workers, "scheduler": scheduler, "writes": out, "reads": [plan.root]}
     do_all(work, tasks, **options, progress="" if quiet else "packing")
     record = _finish(plan, out)
-    return _report(plan, record, out, sum(bool(task.coding) for task in tasks))
+    return _report(plan, record, sum(bool(task.coding) for task in tasks))
 
 
 def _finished(plan: PackingPlan, out: Path) -> PackingReport:
@@ -370,17 +310,16 @@ def _finished(plan: PackingPlan, out: Path) -> PackingReport:
         raise FaceDiffError(f"{out}: holds a corpus that was packed otherwise; choose a new folder, or remove this one")
     for name, array in record.arrays.items():
         sizes = {out / name / shard_key(number, array.width): size for number, size in enumerate(array.shards)}
-        sizes[out / name / METADATA] = len(encoded(array, None, _codec_of(name, record)))
         if odd := [path for path, size in sizes.items() if not path.is_file() or path.stat().st_size != size]:
             raise FaceDiffError(f"{odd[0]}: is missing or damaged; remove the packed corpus, and pack it again")
     _clear(out)
-    return _report(plan, record, out, 0)
+    return _report(plan, record, 0)
 
 
-def _report(plan: PackingPlan, record: Record, out: Path, written: int) -> PackingReport:
+def _report(plan: PackingPlan, record: Record, written: int) -> PackingReport:
     seconds = sum(clip.frames for clip in record.clips.values()) / record.frame_rate
     after = sum(size for array in record.arrays.values() for size in array.shards)
-    return PackingReport(out, len(record.clips), seconds, plan.bytes, after, written, plan.left_out)
+    return PackingReport(len(record.clips), seconds, plan.bytes, after, written, plan.left_out)
 
 
 def _finish(plan: PackingPlan, out: Path) -> Record:
@@ -408,7 +347,7 @@ def _finish(plan: PackingPlan, out: Path) -> Record:
     arrays["files"] = write_blob(out, "files", file_bytes, ((plan.root / path).read_bytes() for path in plan.files))
     for name, array in arrays.items():
         with atomic(out / name / METADATA) as temporary:
-            temporary.write_bytes(encoded(array, None, _codec_of(name, plan.record)))
+            temporary.write_bytes(encoded(array, None))
         count = -(-array.rows // (array.chunk * array.chunks))
         sizes = tuple((out / name / shard_key(shard, array.width)).stat().st_size for shard in range(count))
         arrays[name] = replace(array, shards=sizes)
@@ -439,12 +378,15 @@ def _write(out: Path, root: Path, record: Record, task: PackingTask) -> None:
         rows = np.zeros((array.chunk * array.chunks, array.width), CODINGS[task.coding])
         templates = read_templates(root / "templates.pkl", record.n_vertices)
         for part in task.parts:
-            read = _quantised if task.coding in QUANTISED else _exact
             stored = open_motion(part.path, record.n_vertices).read(range(part.start, part.stop))
-            rows[part.row : part.row + part.stop - part.start] = read(
-                part, stored, templates[part.identity].numpy(), record, rows.dtype
-            )
+            with np.errstate(all="ignore"):
+                refuse_out_of_range(stored.astype(np.float32), range(part.start, part.stop), part.path)
             last = part.row + part.stop - part.start
+            if task.coding in QUANTISED:
+                rows[part.row : last] = _steps(part, stored, templates[part.identity].numpy(), record, rows.dtype)
+            else:  # the bits of absolute vertices as whole numbers
+                exact = np.ascontiguousarray(stored, stored.dtype.newbyteorder("<"))
+                rows[part.row : last] = exact.reshape(len(exact), -1).view(rows.dtype)
             padded = -(-last // array.chunk) * array.chunk
             # The end of a clip's last chunk repeats its last frame: the differences below are zero there.
             rows[last:padded] = rows[last - 1]
@@ -453,12 +395,12 @@ def _write(out: Path, root: Path, record: Record, task: PackingTask) -> None:
             # Differences between frames are small and compress well; each chunk starts with a whole row, so that it can
             # be decoded alone.
             chunk[1:] = chunk[1:] - chunk[:-1]
-        content = encoded(array, rows, record.codec)
+        content = encoded(array, rows)
     with atomic(out / task.target) as temporary:
         temporary.write_bytes(content)
 
 
-def _quantised(
+def _steps(
     part: ShardPart,
     stored: npt.NDArray[np.floating],
     template: npt.NDArray[np.float32],
@@ -467,16 +409,10 @@ def _quantised(
 ) -> npt.NDArray[Any]:
     """Offsets from the template in whole quantisation steps (frames, 3V)."""
     steps = np.empty((len(stored), stored.shape[1] * 3), dtype)
-    limit = np.iinfo(dtype).max
     for first in range(0, len(stored), FRAMES):
-        piece = np.array(stored[first : first + FRAMES], np.float64)
-        with np.errstate(all="ignore"):
-            refuse_out_of_range(piece.astype(np.float32), range(part.start + first, part.stop), part.path)
-        piece -= template
-        piece /= record.step
-        np.rint(piece, out=piece)
+        piece = np.rint((np.array(stored[first : first + FRAMES], np.float64) - template) / record.step)
         largest = float(np.abs(piece).max(initial=0.0))
-        if largest > limit:
+        if largest > np.iinfo(dtype).max:
             raise FaceDiffError(
                 f"{part.path}: a coordinate lies {largest * record.step:.4g} {record.unit.split(' ')[0]} away from the "
                 f"template of {part.identity}, more than can be packed at this tolerance; {REMEDY}, or pack with "
@@ -484,20 +420,6 @@ def _quantised(
             )
         steps[first : first + FRAMES] = piece.reshape(len(piece), -1)
     return steps
-
-
-def _exact(
-    part: ShardPart,
-    stored: npt.NDArray[np.floating],
-    template: npt.NDArray[np.float32],
-    record: Record,
-    dtype: np.dtype[Any],
-) -> npt.NDArray[Any]:
-    """The bits of absolute vertices as whole numbers (frames, 3V)."""
-    stored = np.ascontiguousarray(stored, stored.dtype.newbyteorder("<"))
-    with np.errstate(all="ignore"):
-        refuse_out_of_range(stored.astype(np.float32), range(part.start, part.stop), part.path)
-    return stored.reshape(len(stored), -1).view(dtype)
 
 
 def encode_speech(path: Path) -> bytes:
@@ -540,11 +462,7 @@ def write_blob(out: Path, name: str, size: int, contents: Iterable[bytes]) -> Ar
     return array
 
 
-def _codec_of(array: str, record: Record) -> Codec:
-    return record.codec if array.startswith("motion_") else "zstd"
-
-
-def encoded(array: ArrayInfo, rows: npt.NDArray[Any] | None, codec: Codec = "zstd") -> bytes:
+def encoded(array: ArrayInfo, rows: npt.NDArray[Any] | None) -> bytes:
     """A shard as Zarr writes it, with zeros after ``rows``; the array's ``zarr.json`` if ``rows`` is None."""
     import zarr
     from zarr.codecs import BloscCodec, Crc32cCodec
@@ -554,7 +472,6 @@ def encoded(array: ArrayInfo, rows: npt.NDArray[Any] | None, codec: Codec = "zst
     width = (array.width,) if array.width else ()
     files: dict[str, Any] = {}
     itemsize = np.dtype(array.dtype).itemsize
-    compressor, level = CODECS[codec]
     stored: Any = zarr.create_array(
         store=MemoryStore(files),
         shape=(array.rows if rows is None else shard_rows, *width),
@@ -567,8 +484,8 @@ def encoded(array: ArrayInfo, rows: npt.NDArray[Any] | None, codec: Codec = "zst
             # takes. Smaller blocks take more room; level 5 takes 5 % less room than level 1 and decodes as quickly.
             BloscCodec(
                 typesize=itemsize,
-                cname=compressor,
-                clevel=level,
+                cname="zstd",
+                clevel=5,
                 shuffle="bitshuffle",
                 blocksize=min(array.chunk_bytes, BLOCK),
             ),

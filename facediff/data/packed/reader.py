@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from facediff.data.packed.decoded import USUAL_GB, VARIABLE, DecodedChunks
+from facediff.data.packed.decoded import DecodedChunks
 from facediff.data.packed.layout import (
     DAMAGED,
     EXACT,
@@ -29,7 +29,7 @@ from facediff.data.packed.layout import (
     Record,
 )
 from facediff.data.packed.shards import ShardedArray, chunks_of
-from facediff.data.packed.stores import ByteStore, LocalStore, RemoteStore, cache_folder, limit_bytes, open_store
+from facediff.data.packed.stores import ByteStore, LocalStore, open_store
 from facediff.data.storage import refuse_out_of_range, within
 from facediff.errors import FaceDiffError, damaged
 from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
@@ -66,11 +66,8 @@ class PackedCorpus:
         self.record = Record.read(text, self.source)
         # The record holds the size and place of everything, so its hash identifies the content for caches.
         self.identity = hashlib.sha256(text).hexdigest()[:40]
-        if isinstance(store, RemoteStore):
-            size = sum(sum(array.shards) for array in self.record.arrays.values())
-            store.cache = cache_folder(self.identity, size)
         self.store: ByteStore = store
-        self._decoded_chunks = DecodedChunks(limit_bytes(VARIABLE, USUAL_GB))
+        self._decoded_chunks = DecodedChunks()
         self._arrays = {name: ShardedArray(store, name, array) for name, array in self.record.arrays.items()}
 
     @property

@@ -67,7 +67,7 @@ def test_a_record_is_not_believed(packed: Path, tmp_path: Path, key: str, field:
 
 def test_lossless_motion_is_of_the_type_that_it_is_coded_as(tmp_path: Path) -> None:
     root = write_tiny(tmp_path / "corpus", sentences=1)
-    pack(root, tmp_path / "corpus.zarr", corpus=TINY, lossless=True, unit="furlong", workers=1)
+    pack(root, tmp_path / "corpus.zarr", corpus=TINY, lossless=True, workers=1)
     read_all(tmp_path / "corpus.zarr")
     change(tmp_path / "corpus.zarr", f"{RECORD}.clips.0", lambda place: place.__setitem__("dtype", "float64"))
     with pytest.raises(FaceDiffError, match="float64"):

@@ -26,8 +26,11 @@ pack = partial(packing.pack, exact="none")
 
 
 @pytest.mark.parametrize("chunk", [0.04, 0.5, 60.0])
-def test_windows_are_those_of_the_folder(corpus: Path, tmp_path: Path, chunk: float) -> None:
-    pack(corpus, tmp_path / "out.zarr", corpus=TINY, chunk_seconds=chunk, workers=1)
+def test_windows_are_those_of_the_folder(
+    corpus: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: float
+) -> None:
+    monkeypatch.setattr(packing, "CHUNK_SECONDS", chunk)
+    pack(corpus, tmp_path / "out.zarr", corpus=TINY, workers=1)
     plain, other = Tiny(root=str(corpus)).corpus, Tiny(root=str(tmp_path / "out.zarr")).corpus
     assert list(plain.clips) == list(other.clips)
     rng = np.random.default_rng(1)
