@@ -11,8 +11,7 @@ import hashlib
 import os
 import re
 import sys
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -205,7 +204,7 @@ def fetch(name: str, revision: str | None = None) -> Path:
     with needs_extra("huggingface_hub", "hub", f"fetching the model {name}"):
         from huggingface_hub import snapshot_download
     label = name if revision is None else f"{name}@{revision}"
-    with _hub_errors(label, "fetched"), _progress():
+    with _hub_errors(label, "fetched"):
         options: dict[str, Any] = {"revision": revision, "allow_patterns": list(FILES), "library_name": "facediff"}
         folder = Path(snapshot_download(name, **options))
     if names := missing_files(folder):
@@ -220,29 +219,13 @@ def push(folder: Path, name: str, *, private: bool = False) -> str:
     """Send a model folder to the hub; the model's address."""
     with needs_extra("huggingface_hub", "hub", "sending a model to the hub"):
         from huggingface_hub import HfApi
-    with _hub_errors(name, "sent"), _progress():
+    with _hub_errors(name, "sent"):
         api = HfApi(library_name="facediff")
         address = api.create_repo(name, private=private, exist_ok=True)
         api.upload_folder(
             repo_id=name, folder_path=folder, commit_message="Publish with facediff", allow_patterns=list(FILES)
         )
     return str(address)
-
-
-@contextmanager
-def _progress() -> Iterator[None]:
-    """Without the hub's progress bars outside a terminal."""
-    from huggingface_hub.utils.tqdm import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
-
-    quiet = sys.stderr is None or not sys.stderr.isatty()
-    if not quiet or are_progress_bars_disabled():
-        yield
-        return
-    disable_progress_bars()
-    try:
-        yield
-    finally:
-        enable_progress_bars()
 
 
 def _hub_errors(name: str, action: str) -> AbstractContextManager[None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any
 
 from facediff.errors import FaceDiffError
@@ -39,27 +38,12 @@ def brief(error: object) -> str:
 
 
 def check_format(source: object, stated: object, expected: str | int) -> None:
-    """Refuse a file of another format than this version writes, above all a later one.
-
-    Args:
-        source: the file, for the message.
-        stated: the file's mark of its format; a text that ends in a number (``facediff take 1``), or a number.
-        expected: the mark that this version writes.
-    """
-    if type(stated) is type(expected) and stated == expected:
-        return
-    mark, other_mark = _split_format(expected), _split_format(stated)
-    later = mark is not None and other_mark is not None and other_mark[0] == mark[0] and other_mark[1] > mark[1]
-    advice = "it was written by a later version, update facediff" if later else "write the file again"
-    raise FaceDiffError(f"{source}: its format is {quoted(stated)}; expected {expected!r}; {advice}")
-
-
-def _split_format(mark: object) -> tuple[str, int] | None:
-    """The words and the number of a mark of a format; None if it is no such mark."""
-    if isinstance(mark, int) and not isinstance(mark, bool):
-        return "", mark
-    match = re.fullmatch(r"(.*?) ?(\d{1,9})", mark) if isinstance(mark, str) else None
-    return (match[1], int(match[2])) if match else None
+    """Refuse a file (``source``) with a mark of another format than this version writes."""
+    if type(stated) is not type(expected) or stated != expected:
+        raise FaceDiffError(
+            f"{source}: its format is {quoted(stated)}; expected {expected!r}; update facediff if a later one wrote "
+            f"it, or write it again"
+        )
 
 
 def in_range(array: npt.NDArray[Any]) -> bool:

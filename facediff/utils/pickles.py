@@ -2,15 +2,14 @@
 
 A pickle is a program: it names functions and classes and has them called. :func:`load_pickle` resolves a fixed list of
 names only, and puts harmless objects in the place of NumPy's own, because NumPy trusts the state that a pickle gives
-its types: a crafted dtype turns bytes into object pointers. The names stand for bound methods, since a pickle could set
-the attributes of a function or a class.
+its types: a crafted dtype turns bytes into object pointers. The names stand for bound methods and for Python's own
+types, since a pickle could set the attributes of a function or a class of ours.
 """
 
 from __future__ import annotations
 
 import pickle  # noqa: S403 - restricted below
 import re
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -99,18 +98,6 @@ class Makers:
         """``bytes``, with which older pickles make the content of an empty array."""
         return b""
 
-    def make_dict(self, entries: Iterable[tuple[Any, Any]] = ()) -> dict[Any, Any]:
-        """``collections.OrderedDict``."""
-        return dict(entries)
-
-    def make_set(self, entries: Iterable[Any] = ()) -> set[Any]:
-        """``set``."""
-        return set(entries)
-
-    def make_frozenset(self, entries: Iterable[Any] = ()) -> frozenset[Any]:
-        """``frozenset``."""
-        return frozenset(entries)
-
     def make_object(self, kind: type[StandIn], *base: object) -> StandIn:
         """``copyreg._reconstructor``, with which old pickles make their objects."""
         if not issubclass(kind, StandIn):
@@ -140,13 +127,11 @@ MAKERS = Makers()
 BUILTINS = ("builtins", "__builtin__")
 NAMES: dict[tuple[str, str], Any] = {
     ("_codecs", "encode"): MAKERS.encode,
-    ("collections", "OrderedDict"): MAKERS.make_dict,
+    ("collections", "OrderedDict"): dict,
     ("numpy", "ndarray"): MAKERS.make_ndarray,
     ("numpy", "dtype"): MAKERS.make_dtype,
-    **{
-        (module, name): getattr(MAKERS, f"make_{name}") for module in BUILTINS for name in ("set", "frozenset", "bytes")
-    },
-    **{(module, "complex"): complex for module in BUILTINS},
+    **{(module, kind.__name__): kind for module in BUILTINS for kind in (set, frozenset, complex)},
+    **{(module, "bytes"): MAKERS.make_bytes for module in BUILTINS},
     **{(f"numpy.{core}.multiarray", "_reconstruct"): MAKERS.make_array for core in ("core", "_core")},
     **{(f"numpy.{core}.multiarray", "scalar"): MAKERS.make_scalar for core in ("core", "_core")},
     **{(f"numpy.{core}.numeric", "_frombuffer"): MAKERS.make_array_of_buffer for core in ("core", "_core")},

@@ -33,7 +33,7 @@ HEADERS = {
 
 
 class RefusedError(Exception):
-    """A request that is answered with an error."""
+    """A request that is answered with an error of a status."""
 
     def __init__(self, status: int, message: str) -> None:
         super().__init__(message)
@@ -84,14 +84,15 @@ def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, pu
     return (hosts is None and public_name is None) or name in names
 
 
-class WithHeaders:
-    """Adds :data:`HEADERS` to every response."""
+class OwnPages:
+    """Adds :data:`HEADERS` to every response of an ASGI application, and refuses what :func:`is_own_page` refuses."""
 
-    def __init__(self, app: Any) -> None:  # noqa: ANN401 - any ASGI application
-        self.app = app
+    def __init__(self, app: Any, hosts: Collection[str] | None, public_name: str | None = None) -> None:  # noqa: ANN401
+        self.app, self.hosts, self.public_name = app, hosts, public_name
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401 - of ASGI
         """Answer a request."""
+        from starlette.responses import JSONResponse
 
         async def answer(message: Any) -> None:  # noqa: ANN401
             if message["type"] == "http.response.start":
@@ -99,45 +100,17 @@ class WithHeaders:
                 message = {**message, "headers": [*message.get("headers", []), *added]}
             await send(message)
 
-        await self.app(scope, receive, answer)
-
-
-class OwnPagesOnly:
-    """Refuses requests under another host's name, and those that another page's script sends.
-
-    Args:
-        app: the ASGI application.
-        hosts: as :func:`is_own_page` takes them.
-        public_name: as :func:`is_own_page` takes it.
-    """
-
-    def __init__(self, app: Any, hosts: Collection[str] | None, public_name: str | None = None) -> None:  # noqa: ANN401 - any ASGI application
-        self.app = app
-        self.hosts = hosts
-        self.public_name = public_name
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401 - of ASGI
-        """Answer a request."""
         headers = {name.lower(): value.decode("latin-1") for name, value in scope.get("headers", [])}
-        host, origin = headers.get(b"host", ""), headers.get(b"origin")
-        if is_own_page(host, origin, self.hosts, self.public_name):
-            await self.app(scope, receive, send)
-            return
-        body = b'{"error": "only the page that this server shows may ask it"}'
-        length = str(len(body)).encode()
-        start = [(b"content-type", b"application/json"), (b"content-length", length)]
-        await send({"type": "http.response.start", "status": 403, "headers": start})
-        await send({"type": "http.response.body", "body": body})
+        app = self.app
+        if not is_own_page(headers.get(b"host", ""), headers.get(b"origin"), self.hosts, self.public_name):
+            app = JSONResponse({"error": "only the page that this server shows may ask it"}, 403)
+        await app(scope, receive, answer)
 
 
 async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
     """The object that a request holds.
 
     Only JSON is taken: a page of another origin cannot send that without permission, which it never gets.
-
-    Raises:
-        RefusedError: if it is of another type or too large.
-        FaceDiffError: if it is no JSON.
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
@@ -154,10 +127,10 @@ async def read_body(request: Request, most_bytes: int) -> dict[str, Any]:
 
 
 def own_page_only(hosts: Collection[str] | None, public_name: str | None = None) -> list[Middleware]:
-    """Middleware of an application: strict headers, and :class:`OwnPagesOnly`, which takes these arguments."""
+    """Middleware of an application: :class:`OwnPages`, which takes these arguments."""
     from starlette.middleware import Middleware
 
-    return [Middleware(WithHeaders), Middleware(OwnPagesOnly, hosts=hosts, public_name=public_name)]
+    return [Middleware(OwnPages, hosts=hosts, public_name=public_name)]
 
 
 def require_server(purpose: str, names: Collection[str] = ("starlette", "uvicorn"), extra: str = "study") -> None:
@@ -194,33 +167,25 @@ def run_server(
     try:
         listening = listen(host, port)
     except (OSError, ValueError) as error:  # a name that is none, or an address in use
-        reason = getattr(error, "strerror", None) or brief(error)
         raise FaceDiffError(
-            f"--host {host} --port {port}: cannot be listened at ({reason}); choose another port, or 0 for any free one"
+            f"--host {host} --port {port}: cannot be listened at ({brief(error)}); choose another port, or 0 for any "
+            f"free one"
         ) from error
     with listening:
         name, number = listening.getsockname()[:2]
-        address = f"[{name}]" if ":" in name else name
+        page = f"http://[{name}]:{number}/" if ":" in name else f"http://{name}:{number}/"
         config = uvicorn.Config(
             app, log_level="error", access_log=False, server_header=False, lifespan="off", ws="none"
         )
-        server = make_server(config, lambda: ready(f"http://{address}:{number}/") if ready is not None else None)
+        server = make_server(config, lambda: ready(page) if ready is not None else None)
         server.run(sockets=[listening])
     return bool(stopped)
 
 
 def listen(host: str, port: int) -> socket.socket:
     """A socket that others connect to."""
-    family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    listening = socket.socket(family[0], socket.SOCK_STREAM)
-    try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(family[4])
-        listening.listen(128)
-    except BaseException:
-        listening.close()
-        raise
-    return listening
+    family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    return socket.create_server(address, family=family, backlog=128)  # type: ignore[arg-type]
 
 
 def make_server(config: uvicorn.Config, ready: Callable[[], object]) -> uvicorn.Server:
