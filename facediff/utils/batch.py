@@ -7,8 +7,8 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,10 +32,7 @@ RECORDS = ".facediff-batch"
 
 @dataclass(frozen=True)
 class Outcome(Generic[Result]):
-    """What became of a task: its result, or why it failed (``fatal``: all others would fail for the same reason).
-
-    Of a bug that is survived, there is the ``trace`` as well.
-    """
+    """A task's result, or why it failed (``fatal``: all others would fail alike); of a bug, the ``trace`` as well."""
 
     result: Result | None = None
     problem: str = ""
@@ -48,32 +45,22 @@ def run_batch(
     work: Callable[[Task], Result],
     tasks: Sequence[Task],
     *,
-    workers: int | None = None,
-    scheduler: str | None = "",
-    writes: Path | None = None,
-    reads: Iterable[Path] = (),
     record: Callable[[Task, str, Result | None], None] | None = None,
     survive_bugs: bool = False,
-    progress: str = "",
+    **options: Any,  # noqa: ANN401
 ) -> Generator[tuple[Task, Outcome[Result]]]:
     """Do tasks in several workers past failures, as :func:`~facediff.utils.jobs.run_tasks` does them.
 
     Args:
         work: does a task; picklable, such as :class:`~facediff.utils.jobs.PerWorker`.
         tasks: errors name a task by its ``str()``.
-        workers: number of workers; as many as processors, or as the cluster has, if None.
-        scheduler: where the tasks run; see :func:`~facediff.utils.jobs.run_tasks`.
-        writes: folder that tasks write to.
-        reads: files and folders that tasks read.
         record: called with each task that is done, its problem and its result, in the worker, so that tasks that end
             after Ctrl-C are recorded too; picklable.
         survive_bugs: whether an exception that is no :class:`FaceDiffError` is printed and counts as a failure of the
             task; it is raised otherwise.
-        progress: title of a progress bar; none if empty.
+        options: further ones of :func:`~facediff.utils.jobs.run_tasks`.
     """
-    attempt = partial(_attempt, work, record, survive_bugs)
-    options: dict[str, Any] = {"scheduler": scheduler, "writes": writes, "reads": reads, "progress": progress}
-    with closing(run_tasks(attempt, tasks, workers=workers, **options)) as results:
+    with closing(run_tasks(partial(_attempt, work, record, survive_bugs), tasks, **options)) as results:
         for task, outcome in results:
             if isinstance(outcome, WorkerDied):
                 problem = f"{task}: killed its process, perhaps for lack of memory; try --workers 1"
@@ -88,11 +75,7 @@ def run_batch(
 
 
 def do_all(work: Callable[[Task], Result], tasks: Sequence[Task], **options: Any) -> list[Result]:  # noqa: ANN401
-    """Do tasks that must all succeed: of those that fail, the first in their order is reported at the end.
-
-    Returns:
-        results in the order of the tasks.
-    """
+    """The results, in their order, of tasks that must all succeed; the first that fails is reported at the end."""
     outcomes = dict(run_batch(work, tasks, **options))
     if problem := next(filter(None, (outcomes[task].problem for task in tasks)), ""):
         raise FaceDiffError(problem)
@@ -188,8 +171,7 @@ class Recipe:
 class FileTask:
     """A file to make of another one; ``recipe`` is what else decides it.
 
-    The record lies in a hidden folder next to the output, or in ``records`` where a folder is handed to others who need
-    not know what its files were made of.
+    The record lies in a hidden folder next to the output, or in ``records`` where the output's folder is handed on.
     """
 
     source: Path
@@ -205,12 +187,7 @@ class FileTask:
         return (self.records or self.output.parent) / RECORDS / f"{short_name(self.output.name, 200)}.json"
 
     def record(self, problem: str, written: object = None) -> None:
-        """Record that the task is done.
-
-        Args:
-            problem: empty if the output is there.
-            written: a list of all files that the task wrote, such as the speech next to an animation.
-        """
+        """Record that the task is done: with a problem, or with a list of all files that it wrote."""
         paths = [path for path in written if isinstance(path, Path)] if isinstance(written, list) else []
         record = {
             "speech": _stat(self.source) | {"sha256": _digest(self.source)},
@@ -224,46 +201,31 @@ class FileTask:
     def earlier_problem(self) -> str | None:
         """The problem that an earlier run recorded; None if nothing is recorded."""
         record = self._read_record()
-        return None if record is None else str(record.get("problem") or "")
+        return None if record is None else str(record["problem"])
 
     def change(self) -> str:
-        """What has changed since the task was recorded, in words; empty if nothing has."""
+        """The reason why the task must be done again, in words; empty if nothing has changed since it was recorded."""
         record = self._read_record()
         if record is None:
             return "it is not known how it was made" if self.output.exists() else ""
-        before = record.get("recipe") or {}
-        recorded = before.get("files") or {}
-        if before.get("command") != list(self.recipe.command):
+        before, files = record["recipe"], self.recipe.files
+        if before["command"] != list(self.recipe.command) or before["files"].keys() != files.keys():
             return "the options have changed"
-        for path, digest in self.recipe.files.items():
-            if recorded.get(path) != digest:
-                return f"{path} has changed"
-        if recorded.keys() != self.recipe.files.keys():
-            return "the options have changed"
-        if not self._same_source(record["speech"]):
+        if changed := [path for path, digest in files.items() if before["files"][path] != digest]:
+            return f"{changed[0]} has changed"
+        # By path, size and time; where path or time differ, by the content. What could not be read is tried again.
+        source, earlier = _stat(self.source), record["speech"]
+        unchanged = all(earlier.get(name) == value for name, value in source.items())
+        same_size = "bytes" in source and earlier.get("bytes") == source["bytes"]
+        if not earlier["sha256"] or not (unchanged or (same_size and earlier["sha256"] == _digest(self.source))):
             return "the recording has changed"
-        sizes = {self.output.name: record.get("output_bytes"), **(record.get("next_to") or {})}
-        for name, size in {} if record.get("problem") else sizes.items():
-            if size is None or _bytes(self.output.parent / name) != size:
-                return f"{name} is missing or damaged"
-        return ""
+        sizes = {self.output.name: record["output_bytes"], **(record.get("next_to") or {})}
+        missing = [name for name, size in sizes.items() if size is None or _bytes(self.output.parent / name) != size]
+        return f"{missing[0]} is missing or damaged" if missing and not record["problem"] else ""
 
     def _read_record(self) -> dict[str, Any] | None:
         record = read_json(self._record_file)
-        recipe = {} if record is None else record.get("recipe")
-        parts = [] if record is None else [record.get("speech"), recipe]
-        parts += [recipe.get("files")] if isinstance(recipe, dict) else []
-        parts += [] if record is None else [record.get("next_to") or {}]
-        return record if parts and all(isinstance(part, dict) for part in parts) else None
-
-    def _same_source(self, recorded: Mapping[str, Any]) -> bool:
-        """By path, size and time; where path or time differ, by the content. What could not be read is tried again."""
-        stat = _stat(self.source)
-        if not recorded.get("sha256"):
-            return False
-        return all(recorded.get(name) == value for name, value in stat.items()) or (
-            recorded.get("bytes") == stat.get("bytes") is not None and recorded.get("sha256") == _digest(self.source)
-        )
+        return record if record and record.keys() >= {"speech", "recipe", "output_bytes", "problem"} else None
 
 
 def _bytes(path: Path) -> int | None:
@@ -273,15 +235,14 @@ def _bytes(path: Path) -> int | None:
 
 def _digest(path: Path) -> str:
     """The checksum of a recording; empty if it is gone or may not be read, for which its own task fails."""
-    try:
+    with suppress(FaceDiffError):
         return sha256(path)
-    except FaceDiffError:
-        return ""
+    return ""
 
 
 def _stat(path: Path) -> dict[str, Any]:
-    try:
+    facts: dict[str, Any] = {"path": str(path.resolve())}
+    with suppress(OSError):
         stat = path.stat()
-    except OSError:
-        return {"path": str(path.resolve())}
-    return {"path": str(path.resolve()), "bytes": stat.st_size, "modified_ns": stat.st_mtime_ns}
+        facts |= {"bytes": stat.st_size, "modified_ns": stat.st_mtime_ns}
+    return facts

@@ -102,30 +102,26 @@ def run_tasks(
 ) -> Generator[tuple[Task, Any]]:
     """Do tasks in several workers, and yield each with its result as soon as it is done.
 
-    No worker gets a task before it is free for it, and at most one result for each worker waits to be taken, so memory
-    is bounded and a stop waits only for running tasks. Wrap the generator in :func:`contextlib.closing`, so that it
-    stops with the loop that takes the results: running tasks then have some seconds to come to their end before their
-    process is ended, and nothing else is begun. Workers ignore Ctrl-C; only this process reacts to it.
+    No worker gets a task before it is free for it, and at most one result for each worker waits to be taken. Wrap the
+    generator in :func:`contextlib.closing`: running tasks then have some seconds to come to their end when the loop
+    that takes the results ends. Workers ignore Ctrl-C; only this process reacts to it.
 
     Args:
         work: does a task. For processes and clusters: a picklable function or object, which each worker gets once and
             keeps, such as :class:`PerWorker`. A task may be done again if its worker is lost, so it writes its files
             whole or not at all.
         tasks: its arguments.
-        workers: number of workers; as many as processors, or as the cluster has, if None. One process is not worth
-            starting: its tasks are done in this process.
-        mode: kind of workers on this machine. Processes and threads compute on one processor each. Where processes
-            cannot be started (programs read from standard input, scripts without a main guard), this process does the
-            work.
-        scheduler: where the tasks run, as the option ``--scheduler`` says: a mode that takes precedence over ``mode``,
-            a cluster (see :func:`check_scheduler`), or None for the environment's. Here, if empty.
+        workers: number of workers; as many as processors, or as the cluster has, if None. One works in this process.
+        mode: kind of workers on this machine, each on one processor. Where processes cannot be started (programs read
+            from standard input, scripts without a main guard), this process does the work.
+        scheduler: a mode that takes precedence over ``mode``, or a cluster; see :func:`check_scheduler`.
         writes: folder that tasks write to; workers of a cluster must see it, which is checked.
         reads: files and folders that tasks read; likewise.
         progress: title of a progress bar; none if empty.
 
     Yields:
-        task and result, in the order in which they are done. The result of a task that kills its process is
-        :class:`WorkerDied`: tasks that were running then are tried again, one at a time, so that no other is lost.
+        task and result. The result of a task that kills its process is :class:`WorkerDied`: tasks that were running
+        then are tried again, one at a time, so that no other is lost.
 
     Example:
         >>> dict(run_tasks(len, ["a", "bb"], mode="threads"))
