@@ -155,7 +155,7 @@ def results_of(
 
 
 def outcome(future: Any, scheduler: str) -> Any:  # noqa: ANN401
-    """The result of a task; its error is raised."""
+    """The result of a task, or its error."""
     from distributed import KilledWorker
 
     if future.status not in ("finished", "error"):

@@ -1,8 +1,7 @@
 """Values and type hints: whether a value fits a hint, the hint in words, and plain data converted by it.
 
-It is the one checker of values. Options of the command line, of Python's dataclasses and of decorated functions, the
-constructors of models, components, corpora and callbacks, the trainer's numbers and the arguments in a checkpoint all
-pass here, each at the door where it enters. Ranges of numbers are part of the type: ``Annotated[int, Range(1, 8)]``.
+Options of the command line, of dataclasses, functions and constructors, and the arguments in a checkpoint pass here,
+each at the door where it enters. Ranges of numbers are part of the type: ``Annotated[int, Range(1, 8)]``.
 """
 
 from __future__ import annotations
@@ -75,9 +74,8 @@ class Range:
         if isinstance(number, bool) or not isinstance(number, Real):
             return False
         number = typing.cast(float, number)
-        low = number > self.least if self.above else number >= self.least
-        high = number < self.most if self.below else number <= self.most
-        return low and high and -math.inf < number < math.inf
+        ends = (number == self.least and self.above) or (number == self.most and self.below)
+        return self.least <= number <= self.most and not ends and -math.inf < number < math.inf
 
     def __str__(self) -> str:
         """The range in words; none if it has no ends."""
@@ -134,10 +132,10 @@ def range_of(hint: Any) -> Range | None:  # noqa: ANN401 - a type hint
 
 
 def fits(hint: Any, value: object, limits: Range = Range(), *, stored: bool = False) -> bool:  # noqa: ANN401, B008
-    """Whether a value is one of a type hint.
+    """Whether a value is one of a type hint; types that are not plain, such as our classes, take everything.
 
     Args:
-        hint: the type hint. Other types than plain ones, such as our classes, take everything that is not stored.
+        hint: the type hint.
         value: the value.
         limits: of numbers, where the hint states none.
         stored: whether a file states the value. Then it must be plain data that cannot be read as anything but itself:
@@ -295,17 +293,9 @@ def check_number(
     text: bool = False,
     remedy: str = "",
 ) -> float:
-    """A number that a file states, if it lies in a range.
+    """The number ``name`` of a file (``source``) if it lies in a range and is ``whole`` where asked for.
 
-    Args:
-        source: the file, for the message.
-        name: the number's name in the file.
-        value: from the file.
-        low: smallest allowed number.
-        high: largest allowed number.
-        whole: whether it must be a whole number.
-        text: whether the file holds it as text, as tables do.
-        remedy: advice at the end of the message.
+    As ``text``, as tables hold it, it is read; ``remedy`` ends the message.
 
     Example:
         >>> check_number("manifest.json", "frame_rate", 25, 0.1, 1000)
@@ -328,13 +318,8 @@ def check_number(
 
 def is_plain_text(text: str) -> bool:
     """Whether a text neither refers to a resolver or to another machine nor holds control characters."""
-    return (
-        len(text) <= LONGEST_TEXT
-        and text.isprintable()
-        and "${" not in text
-        and "://" not in text
-        and not text.startswith(("\\\\", "//"))
-    )
+    refers = "${" in text or "://" in text or text.startswith(("\\\\", "//"))
+    return len(text) <= LONGEST_TEXT and text.isprintable() and not refers
 
 
 def is_inert(value: object) -> bool:
@@ -351,23 +336,15 @@ def is_inert(value: object) -> bool:
 
 def is_path(value: object) -> bool:
     """Whether a value can be the import path of a class."""
-    return (
-        isinstance(value, str)
-        and len(value) <= 2 * LONGEST_NAME
-        and "." in value
-        and all(part.isidentifier() for part in value.split("."))
-    )
+    short = isinstance(value, str) and len(value) <= 2 * LONGEST_NAME and "." in value
+    return short and all(part.isidentifier() for part in str(value).split("."))
 
 
 def is_name(text: object) -> bool:
     """Whether a text can name a speaker or a clip in tables and file names."""
-    return (
-        isinstance(text, str)
-        and 0 < len(text) <= LONGEST_NAME
-        and text.isprintable()
-        and not set(text) & set("/\\")
-        and text not in (".", "..")
-    )
+    if not isinstance(text, str) or not 0 < len(text) <= LONGEST_NAME or text in (".", ".."):
+        return False
+    return text.isprintable() and not set(text) & set("/\\")
 
 
 # Doors: the fields of a dataclass, the arguments of a function and of a constructor.
@@ -427,15 +404,11 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 
 
 def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = "") -> Callable[..., None]:
-    """Let a constructor refuse values that do not fit the types and ranges of its signature.
-
-    Other errors that it raises because of a value are reported in the same way, in one sentence that names the
-    arguments as the user wrote them.
+    """Let a constructor refuse values that do not fit its type hints, and report its other errors alike.
 
     Args:
-        init: the constructor; its numbers state their ranges as ``Annotated[int, Range(...)]``.
-        path: prefix of the argument's name in an option; the object's ``options_path``, or else its class's
-            name, if empty.
+        init: the constructor.
+        path: prefix of the argument's name in an option; the object's ``options_path``, or its class's name, if empty.
         sizes: the same for arguments without a default, which are options of the owner.
     """
     signature = inspect.signature(init)
@@ -473,10 +446,7 @@ def checks_arguments(init: Callable[..., None], path: str = "", *, sizes: str = 
 
 
 def options_of(owner: type) -> dict[str, inspect.Parameter]:
-    """The parameters of a constructor by name, those that ``**options`` hands on to a base class included.
-
-    The annotation of each is its type hint; Any if it has none, or none that can be resolved here.
-    """
+    """The parameters of a constructor with their type hints, those that ``**options`` hands on to a base included."""
     parameters: dict[str, inspect.Parameter] = {}
     for cls in owner.__mro__:
         init = vars(cls).get("__init__")

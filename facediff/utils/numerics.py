@@ -1,12 +1,8 @@
-"""Numerical helpers in NumPy: a smooth step, and what SciPy does, which is larger than all the rest of the runtime.
-
-Where SciPy is installed, it finds nearest points in its place, which is faster.
-"""
+"""Numerical helpers in NumPy: a smooth step, and what SciPy does, which is larger than all the rest of the runtime."""
 
 from __future__ import annotations
 
 import importlib.util
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -34,22 +30,11 @@ def has_scipy() -> bool:
     return importlib.util.find_spec("scipy") is not None
 
 
-def nearest_distances(points: Array, targets: Array, limit: float = np.inf) -> Array:
+def nearest_distances(points: Array, targets: Array, limit: float) -> Array:
     """Distance (P,) of each point (P, 3) to the nearest of others (Q, 3); infinite where it is ``limit`` or more."""
-    if has_scipy():
-        from scipy.spatial import cKDTree
-
-        return cast(Array, cKDTree(targets).query(points, distance_upper_bound=limit)[0])
-    return nearest_by_chunks(points, targets, limit)
-
-
-def nearest_by_chunks(points: Array, targets: Array, limit: float = np.inf) -> Array:
-    """The same by all distances."""
-    rows = max(1, CHUNK // max(1, len(targets)))
-    nearest = np.empty(len(points))
-    for begin in range(0, len(points), rows):
-        apart = points[begin : begin + rows, None] - targets[None]
-        nearest[begin : begin + rows] = np.sqrt(np.square(apart).sum(-1).min(1))
+    rows = max(1, CHUNK // len(targets))
+    parts = (points[begin : begin + rows, None] - targets[None] for begin in range(0, len(points), rows))
+    nearest = np.concatenate([np.sqrt(np.square(apart).sum(-1).min(1)) for apart in parts])
     return np.where(nearest < limit, nearest, np.inf)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from facediff.render.meshes import VertexSums
 from facediff.speech.voice_activity import SPEECH_BAND
-from facediff.utils.numerics import BLOCK, RecursiveFilter, nearest_by_chunks, nearest_distances, solve_block_chain
+from facediff.utils.numerics import BLOCK, RecursiveFilter, nearest_distances, solve_block_chain
 
 
 def test_the_speech_band_is_butterworths() -> None:
@@ -31,7 +31,6 @@ def test_nearest_by_chunks_equals_a_tree(monkeypatch: pytest.MonkeyPatch) -> Non
     points, others = rng.normal(size=(200, 3)), rng.normal(size=(30, 3))
     wanted = cKDTree(others).query(points, distance_upper_bound=0.7)[0]
     monkeypatch.setattr("facediff.utils.numerics.CHUNK", 500)  # several chunks
-    np.testing.assert_allclose(nearest_by_chunks(points, others, 0.7), wanted)
     np.testing.assert_allclose(nearest_distances(points, others, 0.7), wanted)
     assert np.isinf(wanted).any()
     assert np.isfinite(wanted).any()
