@@ -141,7 +141,9 @@ def parse(text: str) -> Request:
             plain, moment = plain.removeprefix(prefix), frames
     # An unknown name is an AttributeError too, which a torch module that parses in a property would report as its own.
     with damaged(f"metric {text.strip()}", "choose another"):
-        name, options = metrics.read(plain, _HIDDEN)
+        name, options = metrics.read(plain)
+        if hidden := sorted(options.keys() & _HIDDEN):
+            raise ValueError(f"{name} takes its {hidden[0]} from the corpus")
     if moment != "all":
         parameters = inspect.signature(metrics.get(name).update).parameters.keys()
         ordered = getattr(metrics.get(name), "in_order", False)
