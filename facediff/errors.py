@@ -72,18 +72,15 @@ def lacking(cls: object) -> str:
 
 
 def import_failure(error: BaseException) -> str:
-    """Why a module cannot be imported, with the file and the line that are to be corrected.
-
-    Args:
-        error: what importing it has raised, a mistake in its grammar too.
-    """
-    reason = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
-    file, line = getattr(error, "filename", None), getattr(error, "lineno", None)
-    if not isinstance(error, SyntaxError):
-        frames = [(f.f_code.co_filename, number) for f, number in traceback.walk_tb(error.__traceback__)]
-        frames = [frame for frame in frames if "importlib" not in frame[0]]  # the machinery that runs a module
-        file, line = frames[-1] if frames else (None, None)
-    return f"{file}, line {line}: {reason}" if file else reason
+    """Why importing a module has failed, with the file and the line that are to be corrected."""
+    text = error.msg if isinstance(error, SyntaxError) else " ".join(str(error).split())
+    reason = f"{type(error).__name__}: {text}"
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}, line {error.lineno}: {reason}"
+    frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)][1:]
+    frames = [frame for frame in frames if "importlib" not in frame[0]]  # the machinery that runs a module
+    frames = [frame for frame in frames if "site-packages" not in frame[0]] or frames
+    return f"{frames[-1][0]}, line {frames[-1][1]}: {reason}" if frames else reason
 
 
 def printable(text: object) -> str:

@@ -81,7 +81,7 @@ def animate(
         example: animate the recording that comes with facediff
         checkpoint: trained model (.ckpt), a folder of `facediff publish` or `facediff export-model`, or USER/NAME of
             the Hugging Face hub (default: the model that comes with facediff)
-        output: file to write; its suffix chooses the format (see `facediff export --help`); a folder for a batch
+        output: file to write; its suffix chooses the format (`facediff components export_format`); a folder for a batch
         stream: read PCM (16 bit, mono, little endian) from standard input as it comes
         rate: sample rate of that PCM
         still: the model's motion alone in videos, pages and avatars, where the built-in face else has a lively style

@@ -44,14 +44,6 @@ def name_of(path: Path | str) -> str | None:
     return texts_of(path).get("name")
 
 
-def loggers_of(path: Path | str) -> list[str]:
-    """Class names of the loggers that a config states itself."""
-    trainer = texts_of(path).get("trainer")
-    loggers = trainer.get("logger") if isinstance(trainer, dict) else None
-    entries = loggers if isinstance(loggers, list) else [loggers]
-    return [str(entry["class_path"]).rpartition(".")[2] for entry in entries if entry and "class_path" in entry]
-
-
 def class_of(path: Path | str) -> str | None:
     """The class that a config states: the model's, or of its only part."""
     content = texts_of(path)

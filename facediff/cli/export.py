@@ -3,24 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from facediff.animation.options import AnimationControls, ExportOptions, SourceOptions
 from facediff.cli.options import Animations, Output, check_source, with_different_names
-from facediff.cli.parsing import with_more_help
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
-from facediff.utils.hub import bundled_by_name, may_have_weights
 
 
-def format_table() -> str:
-    """The formats, one a line."""
-    from facediff.export import FORMATS
-
-    return "formats:\n" + "\n".join(f"  {suffix:<7}{form.help}" for suffix, form in FORMATS.items())
-
-
-@with_more_help(format_table)
 def export(
     animations: Animations,
     *,
@@ -32,9 +20,11 @@ def export(
 ) -> None:
     """Write animations as files of other programs. The suffix of OUT chooses the format.
 
+    `facediff components export_format` lists the formats.
+
     Args:
         animations: motion: .npz of `facediff animate`, .npy, or ARKit's weights (.csv of Live Link Face, .json)
-        output: file to write; formats below
+        output: file to write
         quiet: no progress bars
         files: how the files are written.
         source: mesh, frame rate and unit of a bare .npy.
@@ -43,6 +33,7 @@ def export(
     check_source(source)
 
     from facediff.animation import Animation
+    from facediff.editing.blendshapes import has_arkit_weights, is_built_in_face
     from facediff.editing.controls import check_controls
     from facediff.export import FORMATS, check_export, check_used, write_animations
     from facediff.export.writing import seeks_weights
@@ -55,14 +46,13 @@ def export(
         footer = corpus_of_model(source.checkpoint)
     check_used(output.suffix, files.changed())
     options = replace(files, footer=footer, quiet=quiet)
-    lent = source.checkpoint is not None and may_have_weights(bundled_by_name(source.checkpoint))
-    weights = seeks_weights(output, options) and all(
-        _may_have_weights(path, path.suffix == ".npy" and lent) for path in animations
-    )
-    check_export(output, options, len(animations), weights=weights)
     check_controls(controls)
     read = SourceReader(source).read
     motions: list[Animation] = [read(path) for path in animations]
+    weights = seeks_weights(output, options) and all(
+        has_arkit_weights(motion) or is_built_in_face(len(motion.template), motion.faces) for motion in motions
+    )
+    check_export(output, options, len(animations), weights=weights)
     if not controls.is_off:
         from facediff.editing.controls.controlled_face import apply_controls
 
@@ -72,20 +62,3 @@ def export(
         count = f"{len(inside)} files, " if written.is_dir() else ""
         tell(f"{written}: {count}{sum(file.stat().st_size for file in inside) / 1e6:.2f} MB")
     tell(FORMATS[output.suffix].next_step)
-
-
-def _may_have_weights(path: Path, lent: bool) -> bool:
-    """Whether weights can be had of a file's motion before it is read whole; ``lent`` where a model completes it."""
-    from facediff.editing.blendshapes import is_built_in_face
-    from facediff.editing.recorded_weights import SUFFIXES
-    from facediff.utils.arrays import read_arrays
-
-    if lent or path.suffix.lower() in SUFFIXES:
-        return True
-    try:
-        arrays = read_arrays(path, ("values", "faces", "template")) if path.suffix == ".npz" else {}
-    except FaceDiffError:  # reading the file in full reports the reason
-        return False
-    if "values" in arrays or not {"faces", "template"} <= arrays.keys():
-        return "values" in arrays
-    return is_built_in_face(arrays["template"].size // 3, arrays["faces"])

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
 from facediff.animation.options import LicenceOptions
 from facediff.cli.options import CheckpointFile
 from facediff.cli.process import tell
+from facediff.errors import counted
 from facediff.models.published.import_options import ImportOptions
 from facediff.utils.option import Option
-
-MOST_IDENTITIES = 16
-"""Identities that are printed one by one."""
-
-MOST_NAMED = 4
-"""Tensors of one part of a model that are named one by one where they are not needed."""
 
 
 def import_checkpoint(
@@ -56,15 +51,16 @@ def import_checkpoint(
         require_cleared(", ".join(map(str, files)), imported.model.licences)
     save_model(imported.model, output)
     model = imported.model
+    identities = ", ".join(model.identities[:16]) + " …" * (len(model.identities) > 16)
     count = sum(parameter.numel() for parameter in model.parameters())
     tell(
         f"{output}: {type(model).__name__} of {imported.facts.dataset}, {model.n_vertices} "
         f"{'vertices' if model.space.is_vertices else 'channels'}, {model.frame_rate:g} "
-        f"frames a second, identities {few(model.identities)}, {count / 1e6:.1f} M parameters from "
+        f"frames a second, identities {identities}, {count / 1e6:.1f} M parameters from "
         f"{len(imported.weights)} tensors"
     )
-    for names, why in gathered(imported.files.ignored):
-        tell(f"not needed: {names} ({why})")
+    for why, tensors in Counter(imported.files.ignored.values()).items():
+        tell(f"not needed: {counted(tensors, 'tensor')} ({why})")
     for label in model.licences:
         tell(f"licence: {label}")
     for note in imported.facts.notes:
@@ -73,30 +69,3 @@ def import_checkpoint(
         tell(f"next: facediff animate speech.wav --checkpoint {output} -o speech.npy")
     else:
         tell(f"next: train a model of speech on it, with --model.prior={output}")
-
-
-def few(names: Sequence[str]) -> str:
-    """Names, of many the first and the last.
-
-    >>> few(["a", "b"]), few([str(number) for number in range(141)])
-    ('a, b', '0, 1, … 140 (141)')
-    """
-    return (
-        ", ".join(names) if len(names) <= MOST_IDENTITIES else f"{names[0]}, {names[1]}, … {names[-1]} ({len(names)})"
-    )
-
-
-def gathered(ignored: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Tensors by the reason why they are not needed; many of one part of a model as their count.
-
-    >>> gathered({"PPE.pe": "a table", **{f"head.{i}.weight": "of no use" for i in range(9)}})
-    [('PPE.pe', 'a table'), ('head.… of 9 tensors', 'of no use')]
-    """
-    parts: dict[tuple[str, str], list[str]] = {}
-    for name, why in ignored.items():
-        parts.setdefault((name.split(".")[0], why), []).append(name)
-    by_reason: dict[str, list[str]] = {}
-    for (part, why), names in parts.items():
-        labels = names if len(names) <= MOST_NAMED else [f"{part}.… of {len(names)} tensors"]
-        by_reason.setdefault(why, []).extend(labels)
-    return [(", ".join(names), why) for why, names in by_reason.items()]

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
-from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, loggers_of, name_of
+from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, name_of
 from facediff.cli.process import StoppedBySignal, tell
-from facediff.cli.words import change_values, place_of, refuse_early, value_of
-from facediff.errors import FaceDiffError, printable
+from facediff.cli.words import change_values, refuse_early, value_of
+from facediff.errors import FaceDiffError, import_failure
 from facediff.hyperparameters import plain
 from facediff.utils.files import config_dir
 from facediff.utils.hints import defaults
@@ -88,7 +88,6 @@ def lightning(name: str, arguments: Sequence[str]) -> int:
 def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
     """Run one of Lightning's subcommands; the object holds its trainer, model and data module."""
     options = checked_words(name, arguments)
-    tell_replaced_loggers(options)
     checkpoint = value_of(options, "--ckpt_path")
     if checkpoint not in (None, "last", "best"):  # which depend on the config
         check_model_source(checkpoint, "--ckpt_path")
@@ -238,7 +237,7 @@ def import_model(arguments: Sequence[str]) -> str | None:
             importlib.import_module(model.rpartition(".")[0])
         except Exception as error:  # a module can fail in any way while it is imported
             raise FaceDiffError(
-                f"--model {model}: cannot be imported ({place_of(error)}); expected package.module.Class"
+                f"--model {model}: cannot be imported ({import_failure(error)}); expected package.module.Class"
             ) from error
     return model
 
@@ -286,25 +285,6 @@ def find_config(flag: str, value: str) -> str:
     near = difflib.get_close_matches(value, names, n=1)
     hint = f'did you mean "{near[0]}"?' if near else "the bundled ones are configs/experiment/puppet.yaml and others"
     raise FaceDiffError(f"--config {value}: no such file; {hint}")
-
-
-def tell_replaced_loggers(arguments: Sequence[str]) -> None:
-    """Say which loggers of a config a later config replaces: a list in a config is never added to another one's."""
-    earlier: dict[str, str] = {}  # loggers and their files
-
-    def look(flag: str, value: str) -> str:
-        loggers = loggers_of(value) if flag in ("-c", "--config") and os.path.isfile(value) else []  # noqa: PTH113
-        replaced = [logger for logger in earlier if logger not in loggers] if loggers else []
-        if replaced:
-            names = f"{' and '.join(replaced)} of {earlier[replaced[0]]}"
-            note = f"{value}: its loggers replace {names}; list all of them in one config if all are to log"
-            print(printable(note), file=sys.stderr, flush=True)
-        if loggers:
-            earlier.clear()
-            earlier.update(dict.fromkeys(loggers, value))
-        return value
-
-    change_values(arguments, look)
 
 
 def experiment_name(arguments: Sequence[str]) -> str | None:

@@ -6,7 +6,8 @@ positional argument of the command, too. A parameter with a dataclass as its typ
 commands may share: the dataclass's fields are the options, and the function receives an instance.
 
 It is the standard library's argparse that splits the words; this module adds the conversion to the declared types
-(:mod:`facediff.utils.hints`), groups, checks of paths (:mod:`facediff.cli.paths`), and errors of one or two sentences.
+(:mod:`facediff.utils.hints`), groups, errors of one or two sentences, and checks of the files and folders that options
+declare; files with names that a command finds later are checked where they are written (:mod:`facediff.utils.files`).
 """
 
 from __future__ import annotations
@@ -15,18 +16,20 @@ import argparse
 import collections.abc
 import dataclasses
 import inspect
+import os
 import re
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
-from facediff.cli.paths import check_paths
 from facediff.errors import FaceDiffError, choices, refuse_idle
+from facediff.utils.files import check_folder_writable, check_writable
 from facediff.utils.hints import Range, extras_of, range_of, read, shown
 from facediff.utils.option import Option
+from facediff.utils.output_paths import protect, refuse_equal, refuse_overwriting
 
 MISSING = inspect.Parameter.empty
 
@@ -197,23 +200,16 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         return text if quiet or "(default" in text else f"{text} (default: %(default)s)"
 
 
-def make_parser(
-    parameters: Parameters, program: str, summary: str, details: str | Callable[[], str] = ""
-) -> argparse.ArgumentParser:
-    """The parser of a command, such as ``facediff export``.
-
-    ``details`` is the text at the end of the help; a function is called when the help is printed.
-    """
+def make_parser(parameters: Parameters, program: str, summary: str, details: str = "") -> argparse.ArgumentParser:
+    """The parser of a command, such as ``facediff export``; its help begins with a summary and ends with details."""
 
     class CommandParser(argparse.ArgumentParser):
         def error(self, message: str) -> NoReturn:
             raise FaceDiffError(f"{message}; see `{program} --help`")
 
-        def format_help(self) -> str:
-            self.epilog = details() if callable(details) else details
-            return super().format_help()
-
-    parser = CommandParser(prog=program, description=summary, formatter_class=HelpFormatter, allow_abbrev=False)
+    parser = CommandParser(
+        prog=program, description=summary, epilog=details, formatter_class=HelpFormatter, allow_abbrev=False
+    )
     for entry in parameters.values():
         if isinstance(entry, Parameter):
             add(parser, entry)
@@ -259,11 +255,7 @@ def add(parser: Any, parameter: Parameter) -> None:  # noqa: ANN401 - argparse's
 
 
 def parse(
-    parameters: Parameters,
-    arguments: Sequence[str],
-    program: str,
-    summary: str = "",
-    details: str | Callable[[], str] = "",
+    parameters: Parameters, arguments: Sequence[str], program: str, summary: str = "", details: str = ""
 ) -> dict[str, Any]:
     """The values of a command's parameters; a group is an instance of its dataclass."""
     options = flat(parameters)
@@ -330,20 +322,84 @@ def changed(options: Any) -> dict[str, bool]:  # noqa: ANN401 - an instance of a
 
 def arguments_of(function: Callable[..., Any], program: str, arguments: Sequence[str]) -> dict[str, Any]:
     """The arguments of a command function, read from a command line."""
-    summary, details = summary_of(function)
-    late: Callable[[], str] | None = getattr(function, "more_help", None)
-    text = details if late is None else lambda: f"{details}\n\n{late()}".strip()
-    return parse(parameters_of(function), arguments, program, summary, text)
+    return parse(parameters_of(function), arguments, program, *summary_of(function))
 
 
-Function = typing.TypeVar("Function", bound=Callable[..., Any])
+def check_paths(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> None:
+    """Refuse, before any work is done, files that cannot be read or written, and outputs that are inputs.
+
+    The inputs are protected from then on: no output of the command replaces one of them.
+    """
+    inputs: list[Path] = []
+    outputs: list[Path] = []
+    for parameter in parameters:
+        option = parameter.option
+        for path in given_paths(parameter, values.get(parameter.name)):
+            problem, cause = "", typing.cast(Exception | None, None)
+            try:
+                written = option.writes and not (option.reads and path.exists())
+                if str(path) == "-" and (written or option.dash):
+                    problem = "" if option.dash else "is not standard output here; expected the name of a file"
+                elif option.suffixes and path.suffix.lower() not in option.suffixes:
+                    problem = f"expected a name that ends in {' or '.join(option.suffixes)}"
+                elif written:
+                    problem = output_problem(option, path)
+                    outputs.append(path)
+                elif parameter.is_path or path.exists():  # a text may be a name, or a path
+                    problem = input_problem(option, path)
+                    inputs.append(path)
+            except FaceDiffError as error:
+                problem, cause = str(error).removeprefix(f"{path}: "), error
+            except OSError as error:
+                problem, cause = str(error.strerror), error
+            if problem:
+                raise FaceDiffError(f"{parameter.flag} {path}: {problem}") from cause
+    refuse_equal(outputs)
+    refuse_overwriting(inputs, outputs)
+    protect(inputs)
 
 
-def with_more_help(text: Callable[[], str]) -> Callable[[Function], Function]:
-    """Decorator of a command: its help ends with a costly text, which is made when the help is printed."""
+def given_paths(parameter: Parameter, value: Any) -> Iterator[Path]:  # noqa: ANN401
+    """The paths in a value; in a text, such as ``NAME=FOLDER`` or ``a.npy:0.3,b.npy:0.7``, all that may be one."""
+    option = parameter.option
+    if value is None or not (parameter.is_path or option.reads or option.writes):
+        return
+    for entry in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(entry, Path):
+            yield entry
+        elif isinstance(entry, str) and option.writes:
+            yield Path(entry)
+        elif isinstance(entry, str):
+            parts = [entry, *entry.split(",")]
+            parts += [part.partition("=")[2] for part in parts]
+            parts += [re.split(r"[:>]", part)[0] for part in parts]
+            yield from (Path(part) for part in dict.fromkeys(parts) if part and exists(part))
 
-    def decorate(function: Function) -> Function:
-        vars(function)["more_help"] = text
-        return function
 
-    return decorate
+def exists(text: str) -> bool:
+    """Whether a text is the path of a file or folder; no text is too long for that."""
+    try:
+        return os.path.lexists(text)
+    except (OSError, ValueError):
+        return False
+
+
+def output_problem(option: Option, path: Path) -> str:
+    """Why a file or a folder cannot be written; empty if it can."""
+    if option.new and path.exists() and (not path.is_dir() or any(path.iterdir())):
+        return "exists already; choose another folder, or remove it"
+    if option.writes == "folder" or (option.writes == "file or folder" and path.is_dir()):
+        check_folder_writable(path)
+    else:
+        check_writable(path)
+    return ""
+
+
+def input_problem(option: Option, path: Path) -> str:
+    """Why a file or a folder cannot be read; empty if it can."""
+    present = {"file": path.is_file, "folder": path.is_dir}.get(option.exists, path.exists)()
+    if option.exists and not present:
+        return f"no such {option.exists}"
+    if path.exists() and not path.is_file() and not path.is_dir():
+        return "is a device or a pipe; expected a file, or a folder of files"
+    return "cannot be read (permission denied)" if path.exists() and not os.access(path, os.R_OK) else ""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import yaml
 
 from facediff import registry
-from facediff.errors import FaceDiffError, choices, lacking
+from facediff.errors import FaceDiffError, choices, import_failure, lacking
 from facediff.utils.hints import is_path
 
 YAML = (".yaml", ".yml")
@@ -144,19 +143,10 @@ def import_fault(option: str, path: str) -> str:
         cls = vars(importlib.import_module(module)).get(name)
     except Exception as error:  # a module can fail in any way while it is imported
         unknown = getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None
-        return "" if unknown and f"{module}.".startswith(f"{unknown}.") else f"--{option} {path}: {place_of(error)}"
+        return (
+            "" if unknown and f"{module}.".startswith(f"{unknown}.") else f"--{option} {path}: {import_failure(error)}"
+        )
     if cls is None and not module.startswith(("facediff.", "torch.", "lightning.")):
         classes = [n for n, value in vars(importlib.import_module(module)).items() if isinstance(value, type)]
         return f"--{option} {path}: {module} has no {name}: {choices(name, classes)}"
     return f"--{option} {path}: {fault}" if (fault := lacking(cls)) else ""
-
-
-def place_of(error: BaseException) -> str:
-    """File, line and reason of an error in a module that was to be imported."""
-    if isinstance(error, SyntaxError) and error.filename:
-        return f"{error.filename}, line {error.lineno}: {error.msg}"
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__)[1:] if not frame.filename.startswith("<")]
-    code = [frame for frame in frames if "site-packages" not in frame.filename and frame.filename != importlib.__file__]
-    last = (code or frames)[-1:]
-    where = f"{last[0].filename}, line {last[0].lineno}: " if last else ""
-    return f"{where}{type(error).__name__}: {' '.join(str(error).split())}"

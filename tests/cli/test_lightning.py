@@ -23,7 +23,7 @@ import yaml
 
 from facediff.callbacks import checkpoints
 from facediff.cli.app import main
-from facediff.cli.lightning import tell_replaced_loggers, words_of_checkpoint
+from facediff.cli.lightning import words_of_checkpoint
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from tests.cli.conftest import SMALL
@@ -355,16 +355,3 @@ def test_three_processes_score_as_one_does(
                     assert float(other[column]) == pytest.approx(float(value), rel=1e-8)
                 else:
                     assert other[column] == value
-
-
-def test_loggers_that_another_config_replaces_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name, loggers in {"one": ("Wandb", "CSV"), "two": ("CSV",), "three": ("TensorBoard", "CSV")}.items():
-        entries = ", ".join(f"{{class_path: lightning.pytorch.loggers.{logger}Logger}}" for logger in loggers)
-        (tmp_path / f"{name}.yaml").write_text(f"trainer: {{logger: [{entries}]}}\n")
-    one, two, three = ([f"--config={tmp_path / name}.yaml"] for name in ("one", "two", "three"))
-    tell_replaced_loggers(two + three)  # adds one, replaces none
-    assert not capsys.readouterr().err
-    tell_replaced_loggers(one + two)
-    note = capsys.readouterr().err
-    assert all(word in note for word in ("WandbLogger of", "one.yaml", "two.yaml"))
-    assert "CSVLogger" not in note

@@ -144,7 +144,7 @@ def test_plain_loaders_of_batches_train_and_predict_a_trained_model(
 
 
 BROKEN = {
-    "syntax": ("\nclass Mine(object)\n    pass\n", "line 2: expected ':'"),
+    "syntax": ("\nclass Mine(object)\n    pass\n", "line 2: SyntaxError: expected ':'"),
     "import": ("\nimport no_such_package\n", "line 2: ModuleNotFoundError: No module named 'no_such_package'"),
     "name": ("x = 1\ny = undefined\n", "line 2: NameError"),
 }

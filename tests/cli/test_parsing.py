@@ -19,7 +19,6 @@ from facediff.cli.parsing import (
     make_parser,
     parameters_of,
     plain_text,
-    with_more_help,
 )
 from facediff.errors import FaceDiffError
 from facediff.utils.option import Option
@@ -224,20 +223,6 @@ def test_help_shows_defaults_of_zero_and_one_and_no_switch(capsys: pytest.Captur
     assert "how many (default: 1)" in text
     assert "of what (default: 0.0)" in text
     assert text.count("default") == 2
-
-
-def test_costly_help_is_made_when_it_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    made: list[str] = []
-
-    @with_more_help(lambda: made.append("made") or "formats: many")  # type: ignore[func-returns-value]
-    def lazy(*, quiet: bool = False) -> None:
-        """Nothing."""
-
-    arguments_of(lazy, "x", [])
-    assert not made
-    with pytest.raises(SystemExit):
-        arguments_of(lazy, "x", ["--help"])
-    assert "formats: many" in capsys.readouterr().out
 
 
 def all_parameters() -> dict[str, Parameters]:

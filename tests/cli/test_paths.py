@@ -13,8 +13,7 @@ import pytest
 from facediff.cli.app import COMMANDS, load
 from facediff.cli.data import CORPORA, options_of
 from facediff.cli.options import FileOrList, Folder, Map, Output
-from facediff.cli.parsing import Parameters, flat, parameters_of, parse
-from facediff.cli.paths import check_paths
+from facediff.cli.parsing import Parameters, check_paths, flat, parameters_of, parse
 from facediff.errors import FaceDiffError
 from facediff.utils.files import atomic, atomic_folder, put_in_place
 from facediff.utils.option import Option
