@@ -31,8 +31,8 @@ class Format(ABC):
     """A file format that animations are written in.
 
     A format is registered under its suffix without the dot, and the first line of its docstring describes it in
-    ``facediff components export_format``. What all formats have in common, such as checking the animations and the options, naming
-    files, writing the .wav and replacing old files only by complete new ones, is done by
+    ``facediff components export_format``. What all formats have in common, such as checking the animations and the
+    options, naming files, writing the .wav and replacing old files only by complete new ones, is done by
     :func:`facediff.export.write_animations`. Another package adds a format with an entry point::
 
         [project.entry-points."facediff.export_format"]

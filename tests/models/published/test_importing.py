@@ -57,11 +57,11 @@ def test_a_release_card_names_a_method_and_its_options(card: Any) -> None:  # no
     assert card.licence_source
 
 
-def test_every_tensor_is_used_or_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_tensor_is_used_or_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_author_files(tmp_path)
     assert main(words(tmp_path)) == 0
     printed = "".join(capsys.readouterr())
-    assert "PPE.pe" in printed
+    assert "not needed: 1 tensor" in printed
     assert "12 vertices" in printed
     assert (tmp_path / "model.ckpt").is_file()
 
@@ -130,7 +130,7 @@ def test_the_doctor_prints_every_difference_and_writes_nothing(
         "unexpected: more.weight (3,)",
         "misshapen: network.motion_in.weight (16, 5), expected (16, 36)",
         "not finite: network.motion_out.bias",
-        "not needed: 1 tensor",
+        "not needed: PPE.pe",
         "do not fit",
     ):
         assert expected in lines
