@@ -241,7 +241,7 @@ voice_gate = Kind("voice_gate", "facediff.speech.voice_activity", "finds the pau
 acting = Kind("acting", "facediff.editing.acting", "moves brows, head and lids with the speech")
 puppet_voice = Kind(
     "puppet_voice",
-    "facediff.synthetic.voices",
+    "facediff.synthetic.recordings facediff.synthetic.voices",
     "speaks the sentences of the built-in corpus",
 )
 export_format = Kind(

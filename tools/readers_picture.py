@@ -19,7 +19,8 @@ import facediff  # noqa: E402
 from facediff.export import ExportOptions  # noqa: E402
 from facediff.export.video import drawn_frames  # noqa: E402
 from facediff.render import contact_sheet  # noqa: E402
-from facediff.synthetic.recordings import read_aligned, recordings_of, speakers_of  # noqa: E402
+from facediff.synthetic.recordings import recordings_of, speakers_of  # noqa: E402
+from facediff.synthetic.voices import open_voice  # noqa: E402
 from facediff.utils import SAMPLE_RATE  # noqa: E402
 
 PEOPLE, EACH = 6, 3
@@ -39,7 +40,7 @@ def main() -> None:
     model = facediff.load(given.model)
     pictures, labels = [], []
     for speaker in speakers_of(Path(given.readers)):
-        said = [*map(read_aligned, recordings_of(speaker, 9))]
+        said = [open_voice(each.voice).speak("") for each in recordings_of(speaker, 9)]
         found = {kind: [] for kind in KINDS}
         for number, utterance in enumerate(said):
             for phoneme in utterance.phonemes:
@@ -54,7 +55,7 @@ def main() -> None:
                 pick = min(int(time * faces[number].frame_rate), len(faces[number].vertices) - 1)
                 frame = next(iter(drawn_frames([faces[number].part([pick])], ExportOptions(size=SIZE))))
                 pictures.append(np.asarray(frame)[CROP])
-                labels.append(f"{speaker.name} {ipa}")
+                labels.append(f"{Path(speaker).name} {ipa}")
         if len(pictures) == PEOPLE * EACH * len(KINDS):
             break
     sheet = contact_sheet(pictures, EACH * len(KINDS), labels=labels)

@@ -51,7 +51,7 @@ from facediff.speech.espeak import Utterance
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
 from facediff.speech.pitch import HOP, SIZE, signal, spectra
 from facediff.synthetic.cast import KEPT_OUT_PEOPLE
-from facediff.synthetic.recordings import read_aligned, recordings_of, speakers_of
+from facediff.synthetic.recordings import recordings_of, speakers_of
 from facediff.synthetic.sentences import TEST, VALIDATION
 from facediff.synthetic.voices import installed_voices, open_voice
 from facediff.utils import SAMPLE_RATE
@@ -304,8 +304,8 @@ class Bench:
 
     def recorded(self, folder: Path) -> dict[str, float]:
         """Articulation of people's recordings in a folder of `facediff data align`."""
-        stems = ((speaker.name, stem) for speaker in speakers_of(folder) for stem in recordings_of(speaker, 9))
-        return self.strangers((name, read_aligned(stem)) for name, stem in stems)
+        voices = ((Path(name).name, each.voice) for name in speakers_of(folder) for each in recordings_of(name, 9))
+        return self.strangers((name, open_voice(voice).speak()) for name, voice in voices)
 
     def strangers(self, said: Iterable[tuple[str, Utterance]]) -> dict[str, float]:
         """Articulation of speakers, or sentences, without clips; faces and styles of test A take turns."""

@@ -113,7 +113,7 @@ def align(
     output: OutputFolder,
     work: WorkOptions,
 ) -> int:
-    """Write people's recordings with their phones, for facediff.callbacks.SpokenSoundsTerm.
+    """Write people's recordings with their phones, for the built-in corpus (--data.recordings).
 
     Phones come from NAME.TextGrid next to NAME.wav, else from pocketsphinx: for English, of words in NAME.txt or in
     LibriSpeech's *.trans.txt, else of words that it recognises.
@@ -133,8 +133,7 @@ def align(
             recordings, output, workers=work.workers, scheduler=work.scheduler, progress=not work.quiet
         )
     tell(*report.lines())
-    option = "--trainer.callbacks+=facediff.callbacks.SpokenSoundsTerm --trainer.callbacks.recordings"
-    tell(f"Next: facediff fit --config configs/experiment/puppet.yaml {option}={output}")
+    tell(f"Next: facediff fit --config configs/experiment/puppet.yaml --data.recordings={output}")
     return 1 if report.failed else 0
 
 

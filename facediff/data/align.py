@@ -1,8 +1,8 @@
-"""People's recordings with their phones, as :class:`facediff.callbacks.SpokenSoundsTerm` takes them.
+"""People's recordings with their phones, as the built-in corpus takes them (``data.recordings``).
 
 Phones come from a TextGrid next to a recording, where an aligner such as the Montreal Forced Aligner has made one, else
 from pocketsphinx (Carnegie Mellon, BSD), which also recognises English words that are not given. Recordings are cut at
-pauses into pieces that a training can use.
+pauses into pieces that a corpus can use.
 """
 
 from __future__ import annotations

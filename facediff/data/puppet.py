@@ -21,9 +21,10 @@ from facediff.data.storage import RIGS_FOLDER, WEIGHTS_FOLDER, ChannelFolder, Cl
 from facediff.errors import FaceDiffError
 from facediff.spaces import Rotation, Space
 from facediff.synthetic import corpus as puppet
-from facediff.synthetic.cast import MOST_DRAWN, SEEN, UNSEEN, drawn_names
+from facediff.synthetic.cast import ALIGNED, MOST_DRAWN, SEEN, UNSEEN, drawn_names, recorded_names
 from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.known_faces import built_in_rig as built_in_rig
+from facediff.synthetic.recordings import speakers_of
 from facediff.utils.arrays import open_array, open_vertices
 from facediff.utils.files import cache_dir
 from facediff.utils.licences import Commercial
@@ -88,6 +89,9 @@ def cache_root(seed: int = 0, drawn_speakers: int = 0, people: Sequence[str] = (
     """The corpus's folder: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     more = f"-drawn{drawn_speakers}" if drawn_speakers else ""
     more += f"-people{len(people)}" if people else ""
+    # Two folders of recordings may have equally many speakers.
+    if recorded_names(people):
+        more += "-" + hashlib.sha256("\n".join(people).encode()).hexdigest()[:8]
     return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}{more}"
 
 
@@ -112,6 +116,8 @@ class Puppet(SpeechMotionDataModule):
             The test splits do not change.
         people_voices: let every second drawn speaker speak with a voice made from recordings of people, if flite is
             installed.
+        recordings: folder of people's recordings as `facediff data align` writes them, ``SPEAKER/NAME.wav`` or
+            ``.flac`` with ``NAME.TextGrid``: each person is a speaker more, with a drawn face and speaking style.
         motion: ``vertices``, or ``arkit`` for the truth as it is kept: ARKit's 52 shapes and two of
             the tongue, the turns of head and eyes; see docs/parameters.md.
         batch_size: clips a batch; used where no frame budget is given.
@@ -141,13 +147,17 @@ class Puppet(SpeechMotionDataModule):
         seed: Annotated[int, Range(0, 2**32 - 1)] = 0,
         drawn_speakers: Annotated[int, Range(0, MOST_DRAWN)] = 0,
         people_voices: bool = False,
+        recordings: str | None = None,
         motion: Literal["vertices", "arkit"] = "vertices",
         batch_size: Count = 8,
         extra_identities: list[str] | None = None,
         **options: Any,  # noqa: ANN401
     ) -> None:
         people = puppet.people_voices() if people_voices else ()
-        invented = drawn_names(drawn_speakers)
+        if recordings is not None:
+            speakers = speakers_of(Path(recordings).expanduser().absolute())
+            people = (*people, *(f"{ALIGNED}:{speaker}" for speaker in speakers))
+        invented = (*drawn_names(drawn_speakers), *recorded_names(people))
         super().__init__(
             root=str(cache_root(seed, drawn_speakers, people)) if root is None else root,
             batch_size=batch_size,

@@ -21,7 +21,8 @@ from facediff.errors import FaceDiffError
 from facediff.speech.audio import samples_for
 from facediff.speech.phonemes import TimedPhoneme, phonemes_file, read_phonemes
 from facediff.synthetic.articulation import PAUSE, articulations
-from facediff.synthetic.recordings import read_aligned, recordings_of, speakers_of
+from facediff.synthetic.recordings import recordings_of, speakers_of
+from facediff.synthetic.voices import open_voice
 
 SOUNDS = (
     *("pause", "bilabial", "labiodental", "rounded glide or close vowel", "postalveolar", "dental", "sibilant"),
@@ -97,7 +98,8 @@ class SpokenSounds:
         self.augmenter = data.augmenter
         self.people: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]] = []
         for speaker in speakers_of(recordings):
-            for said in map(read_aligned, recordings_of(speaker, MOST)):
+            for recording in recordings_of(speaker, MOST):
+                said = open_voice(recording.voice).speak("")
                 phonemes = [TimedPhoneme(*astuple(phoneme)) for phoneme in said.phonemes]
                 frames = int(len(said.samples) / samples_for(1, self.frame_rate))
                 if frames:

@@ -28,7 +28,7 @@ REMOVED: dict[str, dict[str, Any]] = {
     "facediff.models.audio_encoders.MelEncoder": {"n_mels": 64},
     "facediff.models.mesh_encoders.SpiralMeshEncoder": {"negative_slope": 0.2, "max_frames": None},
     "facediff.models.speaker_encoders.HierarchicalIdentity": {"unseen": "mean"},
-    "facediff.data.puppet.Puppet": {"edition": (None, 2), "recordings": None},
+    "facediff.data.puppet.Puppet": {"edition": (None, 2)},
     "facediff.models.published.faceformer.FaceFormer": {"loop": ANY, "alignment": "auto"},
     "facediff.models.published.talkingstyle.TalkingStyle": {
         **{"loop": ANY, "alignment": "auto", "mouth_weight": 0.6, "style_attention": "one_key"},

@@ -8,7 +8,7 @@ recordings of people where these are asked for.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -109,9 +109,13 @@ _CAST = (
 )
 CAST = {member.name: member for member in _CAST}
 
-DRAWN = "X"
-"""How names of drawn speakers start: ``X01``, ``X02`` …"""
+DRAWN, RECORDED = "X", "P"
+"""How names of drawn speakers start, ``X01``, ``X02`` …, and of those who speak with recordings, ``P001`` …"""
+ALIGNED = "aligned"
+"""Program of the voices that are a person's recordings."""
 MOST_DRAWN = 9999
+RECORDED_FROM = 10_000
+"""Added to the number of a speaker who speaks with recordings, so that nobody else has the same face."""
 KEPT_OUT = ("espeak:en-us+f5", "espeak:en-gb-x-rp+f1", "espeak:en-us+m1", "espeak:en-gb-scotland+m6", "espeak:en+m8")
 """espeak-ng's voices outside the training data: of the unseen speakers and one of test C."""
 KEPT_OUT_PEOPLE = ("flite:slt",)
@@ -125,9 +129,28 @@ def drawn_names(count: int) -> tuple[str, ...]:
     return tuple(f"{DRAWN}{number:02d}" for number in range(1, count + 1))
 
 
+def recorded_names(people: Sequence[str]) -> tuple[str, ...]:
+    """Names of the speakers who speak with recordings, one for each of those among the voices of people."""
+    return tuple(f"{RECORDED}{number:03d}" for number, _ in enumerate(_recorded(people), 1))
+
+
+def _recorded(people: Sequence[str]) -> list[str]:
+    return [voice for voice in people if _is_recorded(voice)]
+
+
+def _is_recorded(voice: str) -> bool:
+    return voice.startswith(f"{ALIGNED}:")
+
+
 def member_of(name: str, people: Sequence[str] = ()) -> CastMember:
     """One of the cast, or a drawn speaker, by name; ``people`` are the voices of people that drawn ones speak with."""
-    return CAST[name] if name in CAST else _drawn(int(name[1:]), tuple(people))
+    if name in CAST:
+        return CAST[name]
+    number = int(name[1:])
+    if name.startswith(DRAWN):
+        return _drawn(number, tuple(voice for voice in people if not _is_recorded(voice)))
+    recorded = _recorded(people)
+    return replace(_drawn(RECORDED_FROM + number, ()), name=name, voice=recorded[number - 1] if recorded else "")
 
 
 @lru_cache(maxsize=128)

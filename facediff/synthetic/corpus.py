@@ -25,11 +25,14 @@ from facediff.synthetic.cast import (
     CAST,
     DRAWN,
     KEPT_OUT_PEOPLE,
+    RECORDED,
+    RECORDED_FROM,
     SEEN,
     UNSEEN,
     CastMember,
     drawn_names,
     member_of,
+    recorded_names,
 )
 from facediff.synthetic.head.mask import N_MASK_VERTICES, build_mask
 from facediff.synthetic.head.parts import AROUND_EYE, N_HEAD_VERTICES, build_head
@@ -37,6 +40,7 @@ from facediff.synthetic.head.people import Complexion, coloured, dressed
 from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs, lip_teeth_pairs
 from facediff.synthetic.performance import MOODS, FaceMotion, synthesise_motion
 from facediff.synthetic.prosody import analyse
+from facediff.synthetic.recordings import recordings_of
 from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, WORDS, turn
 from facediff.synthetic.voices import Delivery, Flite, coloured_speech, open_voice
 from facediff.utils import SAMPLE_RATE
@@ -92,7 +96,7 @@ class PerformedClip:
         return f"{self.identity}_{self.sentence}"
 
 
-def performed_clips(drawn: int = 0) -> tuple[PerformedClip, ...]:
+def performed_clips(drawn: int = 0, people: Sequence[str] = ()) -> tuple[PerformedClip, ...]:
     """All clips, speaker by speaker; moods take turns, so that every speaker has each of them equally often.
 
     Every speaker says other sentences in training, so that no sentence can be known by heart. On test A and B all
@@ -112,6 +116,11 @@ def performed_clips(drawn: int = 0) -> tuple[PerformedClip, ...]:
     moods = tuple(MOODS)
     for index, name in enumerate(drawn_names(drawn)):
         plan.append((name, "train", turn(TRAIN, 5 * index, 24), ""))
+    for name in recorded_names(people):  # who say the recorded sentences
+        recordings = recordings_of(member_of(name, people).voice.partition(":")[2], REFERENCES_EACH)
+        if len(recordings) == 1:  # in another mood, so that it has a style reference
+            recordings *= 2
+        plan += [(name, "train", [(number, each.text)], each.voice) for number, each in enumerate(recordings, 1)]
     return tuple(
         PerformedClip(identity, split, number, text, moods[(number + index) % len(moods)], voice)
         for index, (identity, split, texts, voice) in enumerate(plan)
@@ -155,9 +164,9 @@ class CorpusVariant:
         """Who speaks, drawn speakers of the first corpus aside."""
         return (*MASK_SEEN, *MASK_UNSEEN) if self.mask else tuple(CAST)
 
-    def clips(self, drawn: int) -> tuple[PerformedClip, ...]:
+    def clips(self, drawn: int, people: Sequence[str]) -> tuple[PerformedClip, ...]:
         """All clips."""
-        return mask_clips() if self.mask else performed_clips(drawn)
+        return mask_clips() if self.mask else performed_clips(drawn, people)
 
     def transfer(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Values (V, …) of the head's vertices at the vertices of this corpus's mesh."""
@@ -217,7 +226,8 @@ def generate(
         root: the folder to make.
         seed: random seed; the same seed gives the same bytes.
         drawn: how many drawn speakers say training sentences, besides the cast of ten.
-        people: voices of people with which every second drawn speaker speaks; see :func:`people_voices`.
+        people: voices of people: recordings of people, each of whom is a speaker more, and others
+            (:func:`people_voices`), with which every second drawn speaker speaks.
         workers: how many workers share the work; by default one, or all of a cluster.
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
@@ -228,7 +238,7 @@ def generate(
     if only is None and _is_complete(root, facts):
         return
     _refuse_other(root, facts)
-    every = variant.clips(drawn)
+    every = variant.clips(drawn, people)
     clips = [clip for clip in every if only is None or clip.name in only]
     check_known("the built-in corpus", "clip", only or (), [clip.name for clip in clips])
     with atomic_folder(root, replace=True) as folder:
@@ -240,7 +250,8 @@ def generate(
             "writes": folder,
         }
         frames = sum(do_all(work, clips, **options, progress="Puppet corpus" if progress else ""))
-        counts = {"subjects": len(variant.speakers) + drawn, "vertices": vertex_count(variant), "frames": frames}
+        subjects = len(variant.speakers) + drawn + len(recorded_names(people))
+        counts = {"subjects": subjects, "vertices": vertex_count(variant), "frames": frames}
         more = {"whole": only is None, "clips": len(clips), **counts, "frame_rate": variant.frame_rate}
         write_json(folder / MANIFEST, {**facts, **more, "files": describe_files(folder)})
 
@@ -292,6 +303,7 @@ def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] =
     random = np.random.default_rng([number, len(WORDS), 2])
     text = " ".join(random.choice(WORDS, size=random.integers(5, 9)))
     identity = identities[int(random.integers(len(identities)))]
+    identities = [name for name in identities if not name.startswith(RECORDED)]  # recordings say their own words only
     return speak_clip(PerformedClip(identity, "train", 1, text, str(random.choice([*MOODS]))), people).samples
 
 
@@ -339,9 +351,9 @@ def perform_clip(
     contours = analyse(speech.samples, SAMPLE_RATE)
     frames = round(len(speech.samples) / SAMPLE_RATE * frame_rate)
     everybody = list(CAST)
-    drawn = clip.identity not in CAST
-    speaker = len(everybody) - 1 + int(clip.identity[1:]) if drawn else everybody.index(clip.identity)
-    key = [seed, speaker, *map(ord, clip.sentence)]
+    number = int(clip.identity[1:]) + (RECORDED_FROM if clip.identity.startswith(RECORDED) else 0)
+    invented = len(everybody) - 1 + number if clip.identity not in CAST else 0
+    key = [seed, invented or everybody.index(clip.identity), *map(ord, clip.sentence)]
     draws = _DRAWS if clip.split.startswith("test") else 1
     performances = [
         synthesise_motion(

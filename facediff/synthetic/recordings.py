@@ -1,29 +1,74 @@
-"""People's recordings with their phones, to teach audio encoders.
+"""Recordings of people with their phones as voices of the built-in corpus, so that it speaks as thousands of people do.
 
-A speaker is a folder of recordings, each with a TextGrid of the same name, as `facediff data align`, Praat, the
-Montreal Forced Aligner and WebMAUS write it.
+A speaker is a folder of recordings, each with a TextGrid of the same name: what Praat, the Montreal Forced Aligner and
+WebMAUS write. The recordings are used as they are; the motion's truth is made from the phones, as always.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 from facediff.errors import FaceDiffError
+from facediff.registry import puppet_voice
 from facediff.speech.audio import read_speech
 from facediff.speech.espeak import SpokenPhoneme, Utterance
-from facediff.speech.text_grids import REMEDY, SILENCES, phones_in
-from facediff.synthetic.voices import CMU_PHONES
+from facediff.speech.text_grids import REMEDY, SILENCES, WORDS, find_tier, phones_in, read_text_grid
+from facediff.synthetic.cast import ALIGNED
+from facediff.synthetic.voices import CMU_PHONES, Delivery, Synthesiser
 from facediff.utils import SAMPLE_RATE
 
 SOUNDS = (".wav", ".flac")
-LONGEST = 12.0  # Seconds of a recording that is used
+LONGEST = 12.0  # Seconds of a recording that a corpus takes
 
 
-def speakers_of(folder: Path) -> tuple[Path, ...]:
+@puppet_voice.register(ALIGNED)
+class Aligned(Synthesiser):
+    """A recording of a person with a TextGrid next to it; the voice is its path, with or without a suffix."""
+
+    install = "give a recording with a TextGrid of the same name, aligned:FOLDER/NAME"
+
+    @classmethod
+    def voices(cls) -> list[str]:
+        """None: recordings are the user's."""
+        return []
+
+    @classmethod
+    def open(cls, voice: str, name: str) -> Aligned:  # noqa: ARG003
+        """The recording of a path."""
+        return cls(voice)
+
+    def speak(self, text: str = "", delivery: Delivery = Delivery()) -> Utterance:  # noqa: ARG002, B008 - frozen
+        """The recording, for any text and delivery."""
+        stem = Path(self.voice)
+        stem = stem.with_suffix("") if stem.suffix.lower() in (*SOUNDS, ".textgrid") else stem
+        suffixes = (*SOUNDS, *map(str.upper, SOUNDS))
+        sound = next((path for suffix in suffixes if (path := Path(f"{stem}{suffix}")).is_file()), None)
+        if sound is None:
+            raise FaceDiffError(f"{stem}: no such recording; expected a .wav or .flac file with a .TextGrid")
+        grid = Path(f"{stem}.TextGrid")
+        phonemes, samples = phones_of(grid), read_speech(sound)
+        if phonemes[-1].end > len(samples) / SAMPLE_RATE + 0.1:
+            raise FaceDiffError(
+                f"{grid}: the tier of phones ends at {phonemes[-1].end:.2f} s and {sound.name} at "
+                f"{len(samples) / SAMPLE_RATE:.2f} s; give the recording that was aligned"
+            )
+        return Utterance(samples, phonemes)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording that can be spoken with: the name of its voice, and its words as far as the TextGrid has them."""
+
+    voice: str
+    text: str
+
+
+def speakers_of(folder: Path) -> tuple[str, ...]:
     """Folders of the speakers below a folder, each with at least one aligned recording; sorted."""
-    speakers = tuple(path for path in sorted(folder.glob("*/")) if _stems(path))
+    speakers = tuple(str(path) for path in sorted(folder.glob("*/")) if _stems(path))
     if not speakers:
         raise FaceDiffError(
             f"{folder}: holds no aligned recording; expected SPEAKER/NAME.wav or .flac, each with NAME.TextGrid"
@@ -31,26 +76,20 @@ def speakers_of(folder: Path) -> tuple[Path, ...]:
     return speakers
 
 
-def recordings_of(speaker: Path, count: int) -> list[Path]:
-    """The first recordings of a speaker's folder that last no longer than 12 s, without their suffixes."""
-    short = [stem for stem in _stems(speaker) if phones_of(Path(f"{stem}.TextGrid"))[-1].end <= LONGEST]
-    if not short:
+def recordings_of(speaker: str, count: int) -> list[Recording]:
+    """The first recordings of a speaker's folder that last no longer than 12 s."""
+    recordings = []
+    for stem in _stems(Path(speaker)):
+        grid = Path(f"{stem}.TextGrid")
+        if phones_of(grid)[-1].end <= LONGEST:
+            tier = find_tier(read_text_grid(grid), WORDS) or []
+            text = " ".join(text for _, _, text in tier if text.lower() not in SILENCES)
+            recordings.append(Recording(f"{ALIGNED}:{stem}", text or stem.name))
+        if len(recordings) == count:
+            break
+    if not recordings:
         raise FaceDiffError(f"{speaker}: no recording of {LONGEST:g} s or less; cut them and align them again")
-    return short[:count]
-
-
-def read_aligned(stem: Path) -> Utterance:
-    """A recording and its phones, by its path without a suffix."""
-    suffixes = (*SOUNDS, *map(str.upper, SOUNDS))
-    sound = next(path for suffix in suffixes if (path := Path(f"{stem}{suffix}")).is_file())
-    grid = Path(f"{stem}.TextGrid")
-    phonemes, samples = phones_of(grid), read_speech(sound)
-    if phonemes[-1].end > len(samples) / SAMPLE_RATE + 0.1:
-        raise FaceDiffError(
-            f"{grid}: the tier of phones ends at {phonemes[-1].end:.2f} s and {sound.name} at "
-            f"{len(samples) / SAMPLE_RATE:.2f} s; give the recording that was aligned"
-        )
-    return Utterance(samples, phonemes)
+    return recordings
 
 
 @lru_cache(maxsize=4096)

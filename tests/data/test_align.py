@@ -46,7 +46,9 @@ def test_recordings_are_cut_at_pauses_and_times_stay_right(tmp_path: Path) -> No
         assert phones[-1][1] == pytest.approx(len(sound) / rate, abs=1e-3)
         starts = [place / rate + start for start, _, text in phones if not text and start > 0.25]
         assert all(min(abs(start - time) for time in times) < 0.25 for start in starts)
-    assert all(stem.name.endswith(f"long-{n}") for n, stem in enumerate(recordings_of(tmp_path / "out/anna", 9), 1))
+    assert [
+        voice.voice.endswith(f"long-{n}") for n, voice in enumerate(recordings_of(str(tmp_path / "out/anna"), 9), 1)
+    ]
 
 
 def test_words_are_aligned_by_pocketsphinx_and_a_corpus_can_speak(tmp_path: Path) -> None:
@@ -56,7 +58,7 @@ def test_words_are_aligned_by_pocketsphinx_and_a_corpus_can_speak(tmp_path: Path
     (tmp_path / "in" / "7-1.trans.txt").write_text(f"7-1-0001 {TEXT.upper()}\n")
     assert main(["data", "align", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--workers=1", "--quiet"]) == 0
     grids = sorted((tmp_path / "out" / "7").glob("*.TextGrid"))
-    assert [speaker.name for speaker in speakers_of(tmp_path / "out")] == ["7"]
+    assert [Path(speaker).name for speaker in speakers_of(tmp_path / "out")] == ["7"]
     closing = [p for grid in grids for p in phones_of(grid) if p.ipa in ("p", "b", "m")]
     truth = [p for p in said.phonemes if p.ipa.strip("ˈˌː") in ("p", "b", "m")]
     assert len(closing) == len(truth)
