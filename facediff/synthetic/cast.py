@@ -131,15 +131,11 @@ def drawn_names(count: int) -> tuple[str, ...]:
 
 def recorded_names(people: Sequence[str]) -> tuple[str, ...]:
     """Names of the speakers who speak with recordings, one for each of those among the voices of people."""
-    return tuple(f"{RECORDED}{number:03d}" for number, _ in enumerate(_recorded(people), 1))
+    return tuple(f"{RECORDED}{number:03d}" for number, _ in enumerate(_voices(people, recorded=True), 1))
 
 
-def _recorded(people: Sequence[str]) -> list[str]:
-    return [voice for voice in people if _is_recorded(voice)]
-
-
-def _is_recorded(voice: str) -> bool:
-    return voice.startswith(f"{ALIGNED}:")
+def _voices(people: Sequence[str], *, recorded: bool) -> tuple[str, ...]:
+    return tuple(voice for voice in people if voice.startswith(f"{ALIGNED}:") == recorded)
 
 
 def member_of(name: str, people: Sequence[str] = ()) -> CastMember:
@@ -148,9 +144,9 @@ def member_of(name: str, people: Sequence[str] = ()) -> CastMember:
         return CAST[name]
     number = int(name[1:])
     if name.startswith(DRAWN):
-        return _drawn(number, tuple(voice for voice in people if not _is_recorded(voice)))
-    recorded = _recorded(people)
-    return replace(_drawn(RECORDED_FROM + number, ()), name=name, voice=recorded[number - 1] if recorded else "")
+        return _drawn(number, _voices(people, recorded=False))
+    voices = _voices(people, recorded=True)
+    return replace(_drawn(RECORDED_FROM + number, ()), name=name, voice=voices[number - 1] if voices else "")
 
 
 @lru_cache(maxsize=128)

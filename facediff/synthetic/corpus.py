@@ -302,8 +302,8 @@ def spoken_words(number: int, identities: Sequence[str], people: Sequence[str] =
     """Five to eight random words by one of some speakers, (S,) at 16 kHz; the same number gives the same speech."""
     random = np.random.default_rng([number, len(WORDS), 2])
     text = " ".join(random.choice(WORDS, size=random.integers(5, 9)))
-    identity = identities[int(random.integers(len(identities)))]
-    identities = [name for name in identities if not name.startswith(RECORDED)]  # recordings say their own words only
+    speakers = [name for name in identities if not name.startswith(RECORDED)]  # recordings say their own words only
+    identity = speakers[int(random.integers(len(speakers)))]
     return speak_clip(PerformedClip(identity, "train", 1, text, str(random.choice([*MOODS]))), people).samples
 
 

@@ -187,7 +187,7 @@ def test_the_first_edition_is_refused(tmp_path: Path) -> None:
 def test_further_speech_is_the_same_by_number_and_in_no_sentence_of_the_test() -> None:
     speech = Puppet(drawn_speakers=2).further_speech()
     assert not set(UNSEEN) & set(speech.keywords["identities"])
-    one = spoken_words(3, ("F1", "M1"))
+    one = spoken_words(3, ("F1", "P001", "M1"), ["aligned:somewhere"])
     assert np.array_equal(one, spoken_words(3, ("F1", "M1")))
     assert not np.array_equal(one, spoken_words(4, ("F1", "M1")))
     assert 1.5 < len(one) / 16_000 < 8
