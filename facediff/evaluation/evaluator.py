@@ -291,7 +291,6 @@ class CorpusInputs:
                 "speech": f"score against a corpus folder with wav/{rate}",
                 "conditions": "choose --identity all",
                 "samples": f"a folder holds one sample of each clip; the number of samples {in_test}",
-                "style": f"a model's style encoder {in_test}",
                 "time": f"the time that inference takes {in_test}",
             },
             {} if options.files is None else channel_regions(options.files.space),

@@ -109,9 +109,7 @@ from facediff.metrics.speed import device_name as device_name
 from facediff.metrics.speed import real_time_factor as real_time_factor
 from facediff.metrics.style import NearestSpeakerAccuracy as NearestSpeakerAccuracy
 from facediff.metrics.style import SpeakerGallery as SpeakerGallery
-from facediff.metrics.style import StyleRetrievalAccuracy as StyleRetrievalAccuracy
 from facediff.metrics.style import nearest_speaker_accuracy as nearest_speaker_accuracy
-from facediff.metrics.style import style_retrieval_accuracy as style_retrieval_accuracy
 from facediff.metrics.timing import LipWarpingDistance as LipWarpingDistance
 from facediff.metrics.timing import TemporalMisalignment as TemporalMisalignment
 from facediff.metrics.timing import lip_warping_distance as lip_warping_distance

@@ -7,6 +7,7 @@ import inspect
 import math
 import os
 import re
+import sys
 import typing
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -310,9 +311,6 @@ class UpdateOptions(TypedDict, total=False):
     clip_names: Sequence[str] | None
 
 
-_PACKED = {options.__name__: options for options in (ProcessOptions, FiniteOptions, SequenceOptions, UpdateOptions)}
-
-
 def _full_signature(cls: type, name: str) -> inspect.Signature:
     """A method's signature in which ``**options: Unpack[…]`` is written out, with the defaults of the base classes."""
     inherited: dict[str, inspect.Parameter] = {}
@@ -324,7 +322,7 @@ def _full_signature(cls: type, name: str) -> inspect.Signature:
     signature = inspect.signature(vars(cls)[name])
     written: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
-        packed = _PACKED.get(str(parameter.annotation).rpartition("[")[2].rstrip("]").rpartition(".")[2])
+        packed = vars(sys.modules[cls.__module__]).get(str(parameter.annotation).removeprefix("Unpack[").rstrip("]"))
         if parameter.kind is not inspect.Parameter.VAR_KEYWORD or packed is None:
             written.append(parameter)
         else:

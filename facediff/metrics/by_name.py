@@ -36,7 +36,6 @@ NEEDS: dict[str, str] = {
     "identities": "who speaks in each clip",
     "samples": "several samples of each clip",
     "conditions": "predictions of each clip in the styles of several identities",
-    "style": "style vectors",
     "time": "how long inference took",
 }
 """Needs of metrics, in words.
@@ -45,7 +44,7 @@ The regions come as the constructor's ``lips`` and ``upper``, either sort of pai
 ``frames_per_second`` for eyelids), channels as ``region``, recordings as ``gallery``; ``speech`` as ``sample_rate`` and
 ``frames_per_second``, ``identities`` as ``n_identities``, ``time`` as ``hardware``. With each batch come ``template``
 (of absolute vertices) or ``offsets_from``, ``partner``, ``closures``, ``waveform``, ``identities``, ``samples``,
-``predictions`` (in several styles), ``embeddings`` with ``labels``, and ``computing`` with ``speech``, both in seconds.
+``predictions`` (in several styles), and ``computing`` with ``speech``, both in seconds.
 """
 
 MOMENTS: dict[str, Moment] = {"s_": "speaking", "l_": "listening"}

@@ -41,6 +41,14 @@ def _unit_words(scale: float, *, squared: bool) -> str:
     return unit if scale == 1.0 else f"{unit} of lengths times {scale:g}"
 
 
+class VertexOptions(SequenceOptions, total=False):
+    """Options of every vertex error; see :class:`VertexError`."""
+
+    pooling: Pooling
+    root: bool
+    scale: float
+
+
 class VertexError(SequenceMetric):
     """Distance between predicted and true vertices, over a region or the whole mesh.
 
@@ -113,12 +121,9 @@ class MeanVertexError(VertexError):
         *,
         reduction: Reduction = "mean",
         squared: bool = False,
-        pooling: Pooling = "frames",
-        root: bool = False,
-        scale: float = 1.0,
-        **options: Unpack[SequenceOptions],
+        **options: Unpack[VertexOptions],
     ) -> None:
-        super().__init__(None, reduction=reduction, squared=squared, pooling=pooling, root=root, scale=scale, **options)
+        super().__init__(None, reduction=reduction, squared=squared, **options)
 
 
 mean_vertex_error = functional(MeanVertexError)
@@ -146,18 +151,8 @@ class LipVertexError(VertexError):
 
     needs = ("lips",)
 
-    def __init__(
-        self,
-        lips: RegionLike,
-        *,
-        squared: bool = True,
-        pooling: Pooling = "frames",
-        root: bool = False,
-        scale: float = 1.0,
-        **options: Unpack[SequenceOptions],
-    ) -> None:
-        region = as_region(lips, "lips")
-        super().__init__(region, reduction="max", squared=squared, pooling=pooling, root=root, scale=scale, **options)
+    def __init__(self, lips: RegionLike, *, squared: bool = True, **options: Unpack[VertexOptions]) -> None:
+        super().__init__(as_region(lips, "lips"), reduction="max", squared=squared, **options)
 
 
 lip_vertex_error = functional(LipVertexError)
@@ -185,10 +180,9 @@ class UpperFaceVertexError(VertexError):
         *,
         reduction: Reduction = "mean",
         squared: bool = False,
-        pooling: Pooling = "frames",
-        **options: Unpack[SequenceOptions],
+        **options: Unpack[VertexOptions],
     ) -> None:
-        super().__init__(as_region(upper, "upper"), reduction=reduction, squared=squared, pooling=pooling, **options)
+        super().__init__(as_region(upper, "upper"), reduction=reduction, squared=squared, **options)
 
 
 upper_face_vertex_error = functional(UpperFaceVertexError)

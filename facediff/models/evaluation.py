@@ -142,7 +142,7 @@ ENERGY_REGIONS = ("lips", "upper_face")
 PARAMETERS = "param_"
 """How the names of scores begin that are taken of the channels of a parametric space."""
 
-OF_THE_MODEL = {"samples", "conditions", "style", "time"}
+OF_THE_MODEL = {"samples", "conditions", "time"}
 """Needs that only the model meets: metrics that have one are not taken of a still face or of shuffled speech."""
 
 
@@ -300,15 +300,10 @@ class Evaluation:
     def _context(self, model: Inference, corpus: ScoredCorpus, device: torch.device) -> Context:
         """Inputs of metrics that the corpus and the model have, and reasons why they lack the rest."""
         context, name = corpus.context(self.needs, device), type(model).__name__
-        still = torch.zeros(1, 1, corpus.assets.n_vertices, corpus.assets.space.dims, device=model.device)
-        mask = torch.ones(1, 1, dtype=torch.bool, device=model.device)
-        with torch.inference_mode():
-            styled = "style" in self.needs and model.encode_style(still, mask).shape[1] > 0
-        conditions = {"samples": model.samples, "conditions": len(self._styles(model)) > 1, "style": styled}
+        conditions = {"samples": model.samples, "conditions": len(self._styles(model)) > 1}
         reasons = {
             "samples": f"{name} is deterministic",
             "conditions": "the corpus has no style references of two training identities",
-            "style": f"{name} has no style encoder",
         }
         has = {**context.has, **{need: {} for need, fulfilled in conditions.items() if fulfilled}}
         return replace(context, has=has, reasons={**context.reasons, **reasons})
@@ -343,9 +338,6 @@ class Evaluation:
             if "conditions" in self.needs:
                 views = [with_identity(batch, index, style) for index, style in self._styles(model).items()]
                 inputs["predictions"] = torch.stack([model.generate(view, seed=0) for view in views], 1)
-            if "style" in self.needs:
-                inputs["embeddings"] = model.encode_style(motion, batch.mask)
-                inputs["labels"] = self.corpus.numbers(batch)
         self.update(split, "model", motion, batch, identity, inputs)
 
     def score_baselines(self, split: str, batch: Batch) -> None:

@@ -27,7 +27,6 @@ OF_A_MODEL = {
     "coverage_error",
     "spread_error_ratio",
     "energy_score",
-    "style_retrieval_accuracy",
     "real_time_factor",
     "nearest_speaker_accuracy",
 }

@@ -10,7 +10,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from facediff.metrics import RealTimeFactor, Region, ShannonIndex, StyleRetrievalAccuracy, protocol
+from facediff.metrics import RealTimeFactor, Region, ShannonIndex, protocol
 from tests.fakes.processes import Forked
 from tests.metrics.further_cases import CASES, LIPS, UPPER, pair_batch
 
@@ -24,7 +24,6 @@ ROUNDS: list[list[list[int]]] = [[[0, 1, 2], [3, 4]], [[0, 1, 2, 3, 4], []], [[]
 def metrics() -> dict[str, Any]:
     return {
         **{case.name: case.make() for case in CHOSEN},
-        "style": StyleRetrievalAccuracy(),
         "speed": RealTimeFactor("this machine"),
         "shannon": ShannonIndex([3, 4], clusters=5),
         "protocol": protocol("facediffuser").build(Region("lips", LIPS), Region("upper", UPPER)),
@@ -34,8 +33,6 @@ def metrics() -> dict[str, Any]:
 def batches_of(corpus: Corpus) -> Batches:
     """What each metric is fed for each of the five sequences."""
     found = {case.name: [case.arguments(corpus, [place], 0) for place in range(5)] for case in CHOSEN}
-    embeddings = torch.randn(5, 3, 4, generator=torch.manual_seed(0))
-    found["style"] = [{"embeddings": some, "labels": torch.tensor([0, 1, 2])} for some in embeddings]
     found["speed"] = [{"computing": float(place), "speech": 1.0 + place} for place in range(5)]
     found["shannon"] = [pair_batch(corpus, [place], 0) for place in range(5)]
     found["protocol"] = [corpus.batch([place]) for place in range(5)]
@@ -50,7 +47,7 @@ def told(metric: Any) -> Any:  # noqa: ANN401
     except ValueError as error:
         return str(error)
     assert repr(getattr(metric, "metric_state", None)) == before
-    counted = [getattr(metric, name)() for name in ("coverage", "queries", "summary") if hasattr(metric, name)]
+    counted = [getattr(metric, name)() for name in ("coverage", "summary") if hasattr(metric, name)]
     values = value if isinstance(value, dict) else {"value": value}
     return {name: number.item() for name, number in values.items()}, str(counted)
 
@@ -94,4 +91,4 @@ def test_two_processes_equal_one(corpus: Corpus, tmp_path: Path) -> None:
             for found, wanted in ((split, expected[0]), (lopsided, expected[0]), (afterwards, expected[1])):
                 assert found[1:] == wanted[1:], name
                 assert isinstance(wanted, str) or found[0] == pytest.approx(wanted[0], rel=1e-12), name
-            assert "has no sequence" in nothing or "has no clip" in nothing or "0 style embeddings" in nothing
+            assert "has no sequence" in nothing or "has no clip" in nothing

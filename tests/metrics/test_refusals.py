@@ -14,7 +14,6 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from facediff import metrics as fm
-from facediff.metrics import Coverage, SequenceMetric
 from tests.metrics.further_cases import CASES, Case, pair_batch
 
 
@@ -27,14 +26,12 @@ RIGHT: dict[str, dict[str, Any]] = {
     "speech": {"prediction": motion(), "truth": motion(), "intensity": torch.rand(2, 5)},
     "closures": {"prediction": motion(), "truth": motion(), "closures": [[(0, 2)], [(1, 3), (3, 5)]]},
     "samples": {"samples": torch.stack([motion()] * 3, 1), "truth": motion()},
-    "labels": {"embeddings": torch.eye(3)[:2] + 1, "labels": [0, 0], "clip_names": ["a", "b"]},
 }
 MAKE: dict[str, Callable[..., Any]] = {
     "motion": partial(fm.FaceDynamicsDeviation, [0, 3]),
     "speech": partial(fm.ClipSpeechLipCorrelation, [0], n_identities=1),
     "closures": partial(fm.BilabialClosureRate, [(0, 1)]),
     "samples": partial(fm.EnergyScore, n_samples=3),
-    "labels": fm.StyleRetrievalAccuracy,
 }
 NAN = float("nan")
 WRONG: list[tuple[str, dict[str, Any]]] = [
@@ -80,12 +77,6 @@ WRONG: list[tuple[str, dict[str, Any]]] = [
     ("samples", {"samples": torch.stack([motion()] * 2, 1)}),
     ("samples", {"samples": motion()[0]}),
     ("samples", {"samples": torch.stack([motion()] * 3, 1)[:1]}),
-    ("labels", {"embeddings": torch.ones(3)}),
-    ("labels", {"embeddings": torch.ones(2, 4)}),
-    ("labels", {"labels": [0]}),
-    ("labels", {"labels": [0.5, 1.0]}),
-    ("labels", {"embeddings": torch.tensor([[1.0, 0, 0], [0, 0, 0]])}),
-    ("labels", {"embeddings": torch.tensor([[1.0, 0, NAN], [1, 0, 0]])}),
 ]
 
 
@@ -93,12 +84,11 @@ WRONG: list[tuple[str, dict[str, Any]]] = [
 def test_misfits_are_refused_and_nothing_is_added(kind: str, change: dict[str, Any]) -> None:
     metric = MAKE[kind]()
     metric.update(**RIGHT[kind])
-    before = metric.coverage() if isinstance(metric, SequenceMetric) else metric.queries()
+    before = metric.coverage()
     with pytest.raises((ValueError, TypeError)):
         metric.update(**(RIGHT[kind] | change))
-    assert (metric.coverage() if isinstance(metric, SequenceMetric) else metric.queries()) == before
-    if isinstance(before, Coverage):
-        assert before.sequences == 2 or before.left_out
+    assert metric.coverage() == before
+    assert before.sequences == 2 or before.left_out
 
 
 @pytest.mark.parametrize(
@@ -152,7 +142,6 @@ EVERY: dict[str, tuple[Callable[[], Any], Batch]] = {
     "BlinkRateRatio": (partial(fm.BlinkRateRatio, LIDS), PAIR),
     "EyelidDrift": (partial(fm.EyelidDrift, LIDS), PAIR),
     "NearestSpeakerAccuracy": (partial(fm.NearestSpeakerAccuracy, GALLERY), speaker_batch),
-    "StyleRetrievalAccuracy": (fm.StyleRetrievalAccuracy, lambda _: RIGHT["labels"]),
     "RealTimeFactor": (
         partial(fm.RealTimeFactor, "one core"), lambda _: dict.fromkeys(("computing", "speech"), torch.ones(3)),
     ),

@@ -186,35 +186,26 @@ class Voca(DirectModel):
         self,
         windows: Float[Tensor, "batch frames channels rows"],
         weights: Float[Tensor, "batch identities"],
-        frames: Int[Tensor, " batch"],
+        frames: Int[Tensor, " batch"] | None,
     ) -> Float[Tensor, "batch frames components"]:
-        """Coefficients of the linear shapes for each frame; zero on padding."""
-        # The batch norm must not see padding, so frames stand in one row without it.
-        mask = frame_mask(frames, windows.shape[1])
-        clips = mask.nonzero()[:, 0]
-        valid = self.mixed(windows[mask], weights[clips])
-        # Back to (batch, frames, components) once the batch norm has been passed.
-        padded = valid.new_zeros(*mask.shape, valid.shape[-1])
-        padded[mask] = valid
-        return padded
-
-    def mixed(
-        self, windows: Float[Tensor, "frames channels rows"], weights: Float[Tensor, "frames identities"]
-    ) -> Float[Tensor, "frames components"]:
-        """Coefficients, mixed by the speakers' weights.
+        """Coefficients of the linear shapes for each frame, mixed by the speakers' weights.
 
         The published code mixes vertices. They are linear in the coefficients and the weights sum to 1, so a mixture of
         coefficients is the same.
         """
-        if bool(((weights == 1).sum(1) == 1).all() and ((weights == 0).sum(1) == weights.shape[1] - 1).all()):
-            coefficients: Tensor = self.network(windows, weights)
-            return coefficients
+        if frames is not None and bool(((weights == 0) | (weights == 1)).all()):
+            # The batch norm must not see padding, so frames stand in one row without it.
+            mask = frame_mask(frames, windows.shape[1])
+            valid = self.network(windows[mask], weights[mask.nonzero()[:, 0]])
+            padded = valid.new_zeros(*mask.shape, valid.shape[-1])
+            padded[mask] = valid
+            return padded
         # The network is not linear in the speaker: mixing one-hot vectors at its input would be another speaker
-        # altogether. So every speaker who takes part is computed and the results are mixed.
-        speakers = torch.eye(weights.shape[1], device=weights.device, dtype=weights.dtype)
-        columns = weights.any(0).nonzero().flatten().tolist()
-        parts = [weights[:, k, None] * self.network(windows, speakers[k].expand(len(windows), -1)) for k in columns]
-        return torch.stack(parts).sum(0)
+        # altogether. So every speaker is computed and the results are mixed; nothing depends on the values of weights.
+        count, flat = weights.shape[1], windows.flatten(0, 1)
+        speakers = torch.eye(count, device=weights.device)[:, None].expand(-1, flat.shape[0], -1)
+        mixed = self.network(flat.repeat(count, 1, 1), speakers.flatten(0, 1)).view(count, *windows.shape[:2], -1)
+        return torch.einsum("bk,kbtc->btc", weights, mixed)
 
     # Training and inference.
 
@@ -233,21 +224,8 @@ class Voca(DirectModel):
 
     def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
         """Each frame from its own window."""
-        if frames is None:
-            coefficients = self.of_all(features, weights)
-        else:
-            coefficients = self.coefficients(features, weights, frames)
-        offsets: Tensor = self.network.expression(coefficients)
+        offsets: Tensor = self.network.expression(self.coefficients(features, weights, frames))
         return offsets
-
-    def of_all(
-        self, windows: Float[Tensor, "batch frames channels rows"], weights: Float[Tensor, "batch identities"]
-    ) -> Float[Tensor, "batch frames components"]:
-        """Coefficients without padding, of every speaker, then mixed: nothing depends on the values of the weights."""
-        count, flat = weights.shape[1], windows.flatten(0, 1)
-        speakers = torch.eye(count, device=weights.device)[:, None].expand(-1, flat.shape[0], -1)
-        mixed = self.network(flat.repeat(count, 1, 1), speakers.flatten(0, 1)).view(count, *windows.shape[:2], -1)
-        return torch.einsum("bk,kbtc->btc", weights, mixed)
 
 
 class VocaNetwork(nn.Module):
