@@ -46,14 +46,7 @@ def choices(name: str, candidates: Iterable[str]) -> str:
 
 
 def check_known(source: object, kind: str, names: Iterable[str], candidates: Collection[str]) -> None:
-    """Refuse names that are none of the candidates.
-
-    Args:
-        source: file or option that has the names; an option stands in braces, "{identity}", see :class:`OptionError`.
-        kind: noun for them, such as "corpus".
-        names: to check.
-        candidates: known names.
-    """
+    """Refuse names of a ``kind`` (a noun) that are no candidates; a source that is an option stands in braces."""
     for name in names:
         if name not in candidates:
             raise OptionError.naming(f'{source}: there is no {kind} "{name}": {choices(name, candidates)}')
@@ -197,12 +190,7 @@ class OptionError(FaceDiffError):
 
 
 def refuse_idle(reason: str, **options: bool) -> None:
-    """Refuse options without an effect, such as options of batches for one recording.
-
-    Args:
-        reason: where the options have an effect, as in "is for one recording"; other options in it stand in braces.
-        options: whether an option was given, by its name.
-    """
+    """Refuse options without an effect, such as options of batches for one recording."""
     for name, is_given in options.items():
         if is_given:
             raise OptionError(name, f"{reason}; omit it")

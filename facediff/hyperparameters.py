@@ -64,12 +64,7 @@ def plain(value: Any) -> Any:  # noqa: ANN401
 
 
 def component_class(factory: Any) -> type:  # noqa: ANN401
-    """The class that a factory makes an instance of.
-
-    Args:
-        factory: a class, a ``functools.partial`` of one, or jsonargparse's partial, which holds the class among its
-            arguments.
-    """
+    """The class that a factory makes an instance of."""
     if isinstance(factory, type):
         return factory
     if isinstance(factory, partial):
@@ -229,9 +224,6 @@ def with_classes(options: Options) -> Options:
 
     Factories of the command line hold the parser, and with it the trainer and its processes, which
     weight averaging would copy together with the model.
-
-    Args:
-        options: a dataclass; a field of a kind's name holds a component.
     """
     components = {field.name for field in fields(options)} & COMPONENTS.keys()
     return replace(options, **{name: component_class(getattr(options, name)) for name in components})

@@ -44,12 +44,7 @@ class UnknownComponentError(FaceDiffError, AttributeError):
 
 @dataclass(frozen=True)
 class Entry:
-    """One registered class.
-
-    Attributes:
-        name: by which it is chosen.
-        implementation: the class.
-    """
+    """One registered class."""
 
     name: str
     implementation: type
@@ -166,13 +161,7 @@ class Kind:
         return name, self.options(name, pairs, f"{self.kind} {text}")
 
     def options(self, name: str, pairs: Sequence[tuple[str, str]], source: str) -> dict[str, Any]:
-        """The options of a component as its constructor takes them.
-
-        Args:
-            name: of the component.
-            pairs: options and their values, as typed.
-            source: the name of their option in errors.
-        """
+        """The options of a component as its constructor takes them."""
         component = self.get(name)
         parameters = {name: p for name, p in hints.options_of(component).items() if p.default is not p.empty}
         options = {}
@@ -264,11 +253,7 @@ COMPONENTS: dict[str, Kind] = {name: kind for name, kind in KINDS.items() if kin
 
 
 def alias_path(component: type) -> str:
-    """Import path to store for a component class: its registered path if it has one, else its own.
-
-    Args:
-        component: a class.
-    """
+    """Import path to store for a component class: its registered path if it has one, else its own."""
     for kind in COMPONENTS.values():
         for entry in kind._entries.values():  # noqa: SLF001 - same module; loading everything is not wanted here
             if component is entry.implementation:
@@ -283,10 +268,6 @@ def name_of(component: type) -> str:
 
 def with_paths(content: Any) -> Any:  # noqa: ANN401
     """A config's content with the registered paths in place of the names of components.
-
-    Args:
-        content: of a config, or of a file of one component alone; a name that stands for components of two kinds is
-            replaced only where the key says which.
 
     Example:
         >>> with_paths({"class_path": "gru", "init_args": {"num_layers": 1}})
@@ -315,13 +296,7 @@ def with_paths(content: Any) -> Any:  # noqa: ANN401
 
 
 def find_class(kind: Kind, path: object, base: type) -> Any:  # noqa: ANN401 - a class that is a subclass of ``base``
-    """The class of an import path, if it is registered or its module is imported already; else None.
-
-    Args:
-        kind: where it may be registered; its entries are imported first, so that a plug-in is found.
-        path: the import path.
-        base: required base class.
-    """
+    """The class of an import path, if it is registered or its module is imported already; else None."""
     if not isinstance(path, str) or not hints.is_path(path):
         return None
     module, _, name = path.rpartition(".")

@@ -72,13 +72,7 @@ class EmaWithWarmup(WeightAveraging):
 
     @torch.no_grad()
     def average(self, averages: Sequence[Tensor], weights: Sequence[Tensor], step: Tensor) -> None:
-        """Update the averages of weights of one type on one device.
-
-        Args:
-            averages: the averages so far.
-            weights: the weights after the last optimiser step.
-            step: averaged steps so far, at least 1; on the weights' device, so that nothing waits for it.
-        """
+        """Update the averages of weights of one type on one device."""
         share = (1 - self.decay_at(step.float())).to(averages[0].dtype)
         for average, weight in zip(averages, weights, strict=True):
             average.lerp_(weight, share)

@@ -321,13 +321,10 @@ class DeferredSignals:
 
     A signal in the middle of a step would leave half-updated weights and optimiser states behind. The same signal once
     more does not wait.
-
-    Attributes:
-        waiting: number of the signal that came first; 0 if none has.
     """
 
     def __init__(self) -> None:
-        self.waiting = 0
+        self.waiting = 0  # number of the signal that came first
         self._before: dict[int, Any] = {}
 
     @property

@@ -270,9 +270,6 @@ class ResumableCSVLogger(CSVLogger):
 
     Lightning's deletes the file of a folder that it is given a second time as soon as it starts, and with it the curve
     of a run up to the point where it was stopped.
-
-    Attributes:
-        continues: keep the file that is there.
     """
 
     continues = False
@@ -308,12 +305,7 @@ class ResumableCSVLogger(CSVLogger):
 
 
 class MetricsFile:
-    """``metrics.csv`` and ``hparams.yaml`` of a run; the file of an earlier run stays until the first rows replace it.
-
-    Args:
-        folder: of the run.
-        continues: add to the file that is there.
-    """
+    """``metrics.csv`` and ``hparams.yaml`` of a run; an earlier run's file stays until the first rows replace it."""
 
     def __init__(self, folder: Path, *, continues: bool = False) -> None:
         self.path = folder / "metrics.csv"

@@ -205,11 +205,7 @@ def write_and_tell(
 def check_cells(
     plan: BenchmarkPlan, left: Sequence[Cell], folder: Path, *, dry_run: bool
 ) -> tuple[Setting, dict[tuple[str, str], str]]:
-    """Parse every command to be run, find every corpus, and make the built-in one.
-
-    Returns:
-        the setting of all cells, and how much the tests of trained rows generate, by row and corpus.
-    """
+    """Parse every command to be run, find every corpus, and make the built-in one."""
     from facediff.benchmark.running import Setting, fit_options, option_words
     from facediff.cli.lightning import parse_fit
 
@@ -267,13 +263,7 @@ def check_cells(
 
 
 def cost_of_test(cell: Cell, model: Mapping[str, Any], data: SpeechMotionDataModule) -> str:
-    """How many animations of how many sampling steps a trained cell's test generates, in words.
-
-    Args:
-        cell: it.
-        model: options of the model, those of its parts by names with dots.
-        data: the corpus in training.
-    """
+    """How many animations of how many sampling steps a trained cell's test generates, in words."""
     from facediff.models.evaluation import count_generations
 
     tested = cell.test_options

@@ -136,14 +136,7 @@ LOGGERS = tuple(f"lightning.pytorch.loggers.{name}Logger" for name in ("CSV", "T
 
 
 class FaceDiffCLI(LightningCLI):
-    """LightningCLI with a name for the experiment, and a model that takes its sizes from the data module.
-
-    Args:
-        command: the subcommand.
-        experiment: name of the runs.
-        until_end: contexts that last as long as the subcommand.
-        options: the base class's.
-    """
+    """LightningCLI with a name for the experiment, and a model that takes its sizes from the data module."""
 
     def __init__(
         self,

@@ -135,14 +135,7 @@ def notes() -> Iterator[None]:
 
 
 def confirm_cost(yes: bool, lower: str, *, seconds: float = 0.0, size: float = 0.0) -> None:
-    """Name the cost of a command where it is high, and start only if the user agrees.
-
-    Args:
-        yes: whether the user has agreed beforehand.
-        lower: the options that lower the cost.
-        seconds: roughly how long it takes on two processor cores.
-        size: bytes that it takes in memory, or on disk until it has ended.
-    """
+    """Name a high cost, in seconds on two processor cores and in bytes, and start only if the user agrees."""
     if yes or (seconds <= LONG and size <= LARGE):
         return
     costs = [f"{seconds / 3600:.3g} hours on two processor cores"] if seconds > LONG else []

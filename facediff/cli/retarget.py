@@ -117,16 +117,7 @@ def retarget(
 def write_transferred(
     motion: Animation, target: Path, output: Path, options: TransferOptions, *, dressed: bool, driven: list[str] | None
 ) -> None:
-    """Transfer a motion by the surface, write it, and report how well it fits.
-
-    Args:
-        motion: the animation.
-        target: the other face.
-        output: file to write.
-        options: of the command.
-        dressed: whether a copy of the target's file is written, with materials, skins and targets.
-        driven: notes on the target's own shapes, if they play the motion.
-    """
+    """Transfer a motion by the surface, write it, and report how well it fits."""
     from facediff.editing.fit_check import refuse_poor
     from facediff.editing.retargeting import has_z_up, retarget
     from facediff.export import ExportOptions, write_animations

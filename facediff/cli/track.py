@@ -141,12 +141,7 @@ def person(
 
 
 def sync_warnings(root: Path, people: Iterable[str]) -> Iterator[str]:
-    """Warnings about people of a corpus with sound that is out of step, by the mouth of the bundled model.
-
-    Args:
-        root: corpus of ``facediff data track``.
-        people: names.
-    """
+    """Warnings about people of a corpus with sound that is out of step, by the mouth of the bundled model."""
     import numpy as np
 
     from facediff.data.corpus import LIP_PAIRS, read_manifest

@@ -108,16 +108,6 @@ class AnimationPipeline(ABC):
 
     A subclass opens its model, and then calls this constructor.
 
-    Args:
-        options: the choices.
-        face: what :class:`facediff.animation.Animation` has of the face: ``template``, ``regions``, ``frame_rate`` …
-        windows: how long speech is cut.
-        model: name of the model, for errors.
-        samples: whether the model's motion depends on a seed.
-        usual_gate: the model's voice gate, where the options choose none.
-        rest_weights: how far each vertex (V,) goes to rest in pauses, where the model's motion is vertices.
-        decoder: turns the channels of the model's motion into vertices; None where it is vertices.
-
     Attributes:
         seed: of the first sample.
         gate: the voice gate's name with its options.
@@ -136,13 +126,13 @@ class AnimationPipeline(ABC):
         self,
         options: AnimationOptions,
         *,
-        face: dict[str, Any],
+        face: dict[str, Any],  # fields of an Animation: template, regions, frame_rate …
         windows: WindowPlan,
-        model: str,
-        samples: bool,
+        model: str,  # its name, for errors
+        samples: bool,  # whether the motion depends on a seed
         usual_gate: str,
-        rest_weights: Callable[[], Array],
-        decoder: ChannelDecoder | None = None,
+        rest_weights: Callable[[], Array],  # how far each vertex (V,) goes to rest in pauses
+        decoder: ChannelDecoder | None = None,  # of motion that is channels
     ) -> None:
         self.options, self.facts, self.windows = options, face, windows
         if options.alive and decoder is None and self.is_built_in:
@@ -281,17 +271,7 @@ class AnimationPipeline(ABC):
     def write(
         self, recording: SpeechRecording, output: Path, export: ExportOptions, *, seed: int | None = None
     ) -> tuple[list[Path], Animation]:
-        """Animate a recording and write the animations.
-
-        Args:
-            recording: its speech is animated; its sound and name are the animations'.
-            output: the file; its suffix names the format.
-            export: how it is written.
-            seed: of the first sample; the options' if None.
-
-        Returns:
-            the files, and the first animation.
-        """
+        """Animate a recording and write the animations; the files, and the first animation."""
         from facediff.export import write_animations
         from facediff.mesh.textures import hands_on_textures
 
@@ -346,12 +326,7 @@ class AnimationPipeline(ABC):
             ]
 
     def stream(self, rate: int = SAMPLE_RATE, *, channels: bool = False) -> AnimationStream:
-        """What animates speech of any length while it arrives.
-
-        Args:
-            rate: sample rate of the speech.
-            channels: give the channels (m, C, 1) of the model's motion instead of vertices; see :attr:`gives_channels`.
-        """
+        """Animates speech of any length while it arrives; gives vertices, or the motion's ``channels`` (m, C, 1)."""
         plain = channels or (self.face is None and self.decoder is None)
         stages = [stage for stage in self.stages if not (plain and isinstance(stage, Decode | Direct))]
         steps = [stage.stream(self.seed) for stage in stages]

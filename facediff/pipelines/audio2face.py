@@ -38,13 +38,7 @@ Part = Literal["skin", "tongue"]
 
 
 def solve_weights(model: Audio2Face, part: Part, vertices: Array) -> Array:
-    """NVIDIA's weights (T, K) of the folder's blendshapes, in the order of ``model.folder.poses[part].names``.
-
-    Args:
-        model: the model.
-        part: of the face.
-        vertices: absolute positions (T, V, 3) of all of its vertices.
-    """
+    """NVIDIA's weights (T, K) of the folder's blendshapes, in the order of ``model.folder.poses[part].names``."""
     poses = model.folder.poses.get(part)
     if poses is None:
         raise FaceDiffError(f"{model.folder.network.parent}: has no blendshapes of the {part}; get the whole folder")
@@ -65,12 +59,7 @@ def solve_weights(model: Audio2Face, part: Part, vertices: Array) -> Array:
 
 
 class Audio2FacePipeline(AnimationPipeline):
-    """Animates recordings with a folder of Audio2Face-3D.
-
-    Args:
-        options: the choices; ``style`` says how strong each emotion is.
-        model: a model that is open already. None to open the folder.
-    """
+    """Animates recordings with a folder of Audio2Face-3D."""
 
     def __init__(self, options: AnimationOptions, *, model: Audio2Face | None = None) -> None:
         refuse_fixed(options)
@@ -218,13 +207,7 @@ class SolveChannels(Stage):
 
 
 class Audio2FaceStream:
-    """Animates speech that arrives in pieces: a frame is certain once its window has been heard.
-
-    Args:
-        model: the model.
-        frame_rate: frames a second.
-        emotion: strengths of explicit emotions.
-    """
+    """Animates speech that arrives in pieces: a frame is certain once its window has been heard."""
 
     def __init__(self, model: Audio2Face, frame_rate: float, emotion: dict[str, float]) -> None:
         self.model, self.frame_rate, self.emotion = model, frame_rate, emotion

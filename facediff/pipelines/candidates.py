@@ -70,43 +70,22 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class CandidateMotion:
-    """A candidate's motion for all clips.
-
-    Attributes:
-        candidate: the candidate.
-        clips: by name.
-        frame_rate: frames a second.
-        jaw: the channel that opens the jaw, of motion that is channels; None on the open face.
-        way: how it was put on the open face, or why it was not.
-        licence: in a line.
-        commercial_use: allowed, forbidden or unknown.
-        seconds: of the processor for a second of speech, loading left out; None for motion from elsewhere.
-        memory: bytes that the process had at most; None if that is not known.
-    """
+    """A candidate's motion for all clips."""
 
     candidate: Candidate
     clips: Mapping[str, SpokenMotion]
     frame_rate: float
-    jaw: int | None
-    way: str
+    jaw: int | None  # the channel that opens it, of motion that is channels
+    way: str  # in which it was put on the open face, or the reason why it was not
     licence: str
     commercial_use: str
-    seconds: float | None = None
-    memory: float | None = None
+    seconds: float | None = None  # of the processor for a second of speech, loading left out
+    memory: float | None = None  # bytes that the process had at most
 
 
 @dataclass
 class Placement:
-    """Puts animations of one candidate on the open face.
-
-    Args:
-        face: the face.
-        flame: the user's FLAME model; None if there is none.
-
-    Attributes:
-        way: how it was done, once it was.
-        jaw: the channel that opens the jaw, where motion stays channels.
-    """
+    """Puts animations of one candidate on the open face."""
 
     face: OpenFace
     flame: Flame | None = None

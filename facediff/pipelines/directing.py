@@ -32,17 +32,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class StyledRun:
-    """One way of generating a recording.
+    """One way of generating a recording."""
 
-    Attributes:
-        style: the identity's own one if None.
-        keys: of the style; empty without them.
-        text: the keys' value that stands for it.
-    """
-
-    style: Reference | Style | None
-    keys: tuple[Key, ...] = ()
-    text: str = ""
+    style: Reference | Style | None  # the identity's own one if None
+    keys: tuple[Key, ...] = ()  # of the style
+    text: str = ""  # the keys' value that stands for it
 
 
 def plan_runs(
@@ -83,15 +77,6 @@ class DirectedStream:
     """Animates speech while it arrives, as :class:`facediff.models.inference.SpeechStream` does, along keys over time.
 
     It gives absolute vertices (seeds, m, V, 3) as arrays.
-
-    Args:
-        model: with its choices made, which hold for the stream.
-        runs: to generate.
-        identity: the animated face.
-        condition: the training identity that conditions the model; the face's if None.
-        seeds: one for each sample.
-        precision: makes a context within which the network computes; the style is encoded within it as well, as it is
-            for a file.
 
     Attributes:
         frames: how many have been given out so far.

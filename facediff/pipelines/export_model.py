@@ -76,9 +76,6 @@ def export_model(
         speech: (S,) at 16 kHz that the folder is compared with the model on; noise bursts if None.
         identities: faces and styles of the folder; all that the model knows if None.
         styles: further styles by their names.
-
-    Returns:
-        the description, with the comparison in ``check``.
     """
     from facediff.pipelines.trained import with_rig
 
@@ -204,11 +201,6 @@ def store_weights(document: onnx.ModelProto, precision: Precision, module: torch
     """Store large weights in fewer bits, each followed by a node that widens it.
 
     Numbers that are not learnt, such as the kernel of spectra, stay as they are unless they take megabytes.
-
-    Args:
-        document: changed in place.
-        precision: ``int8`` rounds to 255 steps for each output channel of a convolution or a linear map.
-        module: recorded in the graph.
     """
     from onnx import TensorProto, helper, numpy_helper
 

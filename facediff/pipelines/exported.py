@@ -23,12 +23,7 @@ FIXED = ("sampler", "steps", "guidance", "style_template", "precision", "device"
 
 
 class ExportedPipeline(AnimationPipeline):
-    """Animates recordings with an exported model.
-
-    Args:
-        options: the choices.
-        model: a model that is open already, which stays as it is. None to open the folder.
-    """
+    """Animates recordings with an exported model."""
 
     def __init__(self, options: AnimationOptions, *, model: RuntimeModel | None = None) -> None:
         fixed = {name: value for name, value in options.changed().items() if (name, value) != ("device", "auto")}

@@ -55,21 +55,13 @@ Array64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Consecutive frames on their way through the stages.
-
-    Attributes:
-        start: number of the first.
-        points: (m, points, dims) as the model moves them: vertices, or channels.
-        gestures: (m, 5) of acting, where there is any.
-        turns: (m, 3) of the head, axis-angle in radians, where channels say it.
-        animation: the frames as vertices, once they are decoded.
-    """
+    """Consecutive frames on their way through the stages."""
 
     start: int
-    points: Array
-    gestures: Array64 | None = None
-    turns: Array64 | None = None
-    animation: Animation | None = None
+    points: Array  # (m, points, dims) as the model moves them: vertices, or channels
+    gestures: Array64 | None = None  # (m, 5) of acting
+    turns: Array64 | None = None  # (m, 3) of the head, axis-angle in radians, where channels say it
+    animation: Animation | None = None  # of the frames, once they are decoded
 
     def __len__(self) -> int:
         return len(self.points)
@@ -81,11 +73,7 @@ class Stretch:
 
 
 class Spool:
-    """Consecutive frames that come one stretch after the other: in memory, or in a file.
-
-    Args:
-        folder: for the file; None for memory.
-    """
+    """Consecutive frames that come one stretch after the other: in memory, or in a file."""
 
     def __init__(self, folder: Path | None) -> None:
         self._parts: list[Array] = []
@@ -114,21 +102,13 @@ class Spool:
 
 @dataclass(eq=False)
 class SampleMotion:
-    """One sample of a recording: its frames, still to come in stretches, or all of them as an animation.
-
-    Attributes:
-        seed: of its random numbers.
-        name: of its animation.
-        folder: for motion that is too long for memory; None to keep it there.
-        stretches: the frames to come; None once they are an animation.
-        gestures: (T, 5) of acting, where there is any.
-    """
+    """One sample of a recording: its frames, still to come in stretches, or all of them as an animation."""
 
     seed: int
     name: str
-    folder: Path | None
-    stretches: Iterator[Stretch] | None = None
-    gestures: Array64 | None = None
+    folder: Path | None  # for motion that is too long for memory
+    stretches: Iterator[Stretch] | None = None  # None once they are an animation
+    gestures: Array64 | None = None  # (T, 5) of acting
     _animation: Animation | None = None
     _turns: Array64 | None = None
 
@@ -170,19 +150,12 @@ class SampleMotion:
 
 @dataclass(eq=False)
 class Take:
-    """A recording on its way through the stages.
-
-    Attributes:
-        recording: the recording.
-        speech: (S,) at 16 kHz as the model hears it.
-        samples: of it.
-        frames: of every sample, once they are generated.
-    """
+    """A recording on its way through the stages."""
 
     recording: SpeechRecording
-    speech: Array
+    speech: Array  # (S,) at 16 kHz as the model hears it
     samples: list[SampleMotion]
-    frames: int = 0
+    frames: int = 0  # of every sample, once they are generated
 
 
 class Step(Protocol):
@@ -383,12 +356,7 @@ class Act(Stage):
 
 
 class Decode(Stage):
-    """The model's points become an animation of the face.
-
-    Args:
-        animation: makes one of the face at rest, with a sample's name and metadata; without them for None.
-        decoder: turns channels into vertices; None where the points are vertices.
-    """
+    """The model's points become an animation of the face."""
 
     def __init__(self, animation: Callable[[SampleMotion | None], Animation], decoder: ChannelDecoder | None) -> None:
         self.animation, self.decoder = animation, decoder
@@ -502,11 +470,6 @@ class Direct(Stage):
 class Retarget(Stage):
     """The motion on another mesh. All samples have one face, so that one correspondence serves all.
 
-    Args:
-        mesh: the other face at rest.
-        file: of the correspondence, used if it exists, else written; None for neither.
-        own_shapes: whether the mesh is an avatar that shapes of its own move: weights then stay as they are.
-
     Attributes:
         correspondence: between both meshes, once it is known.
         notes: about a correspondence that was fitted anew.
@@ -561,11 +524,6 @@ class AnimationStream:
     """Animates speech of any length and any sample rate while it arrives; memory does not grow with its length.
 
     The frames equal the whole recording's, however the speech is cut into pieces.
-
-    Args:
-        generator: the model at the beginning of speech.
-        steps: of the stages after it.
-        rate: sample rate of the speech.
 
     Attributes:
         heads: how the head moved as a whole in the frames that were given last (m, 6); None if nothing moves it.

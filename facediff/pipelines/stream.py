@@ -25,14 +25,7 @@ if TYPE_CHECKING:
 
 
 def animate_stream(options: AnimationOptions, output: Path, export: ExportOptions, *, rate: int = 16_000) -> None:
-    """Animate samples of standard input as they come, until they end or Ctrl-C ends them.
-
-    Args:
-        options: of inference; those that need the whole animation are refused.
-        output: a .npy file, or ``-`` for raw float32 vertices to standard output.
-        export: likewise.
-        rate: sample rate of the 16-bit mono samples.
-    """
+    """Animate samples of standard input as they come, until they end or Ctrl-C ends them."""
     check_stream(options, output, export)
 
     pipeline = open_pipeline(options)

@@ -54,13 +54,7 @@ def open_pipeline(options: AnimationOptions) -> AnimationPipeline:
 
 
 class TrainedPipeline(AnimationPipeline):
-    """Animates recordings with a trained model.
-
-    Args:
-        options: the choices.
-        model: a model that is loaded already, on its device; it keeps the choices of the options. None to load the
-            checkpoint.
-    """
+    """Animates recordings with a trained model."""
 
     takes_style_keys = True
 
@@ -320,12 +314,7 @@ def on_processor(device: str) -> bool:
 
 
 def usable_device(name: str, option: str = "device") -> str:
-    """The device's name; ``auto`` is a CUDA device where there is one, and the processor elsewhere.
-
-    Args:
-        name: as torch calls it, or ``auto``.
-        option: by which it is chosen.
-    """
+    """The device's name; ``auto`` is a CUDA device where there is one, and the processor elsewhere."""
     import torch
 
     if name == "auto":

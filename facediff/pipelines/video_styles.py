@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 def with_video_styles(style: object, model: Callable[[], Any]) -> object:
-    """A style with a file of motion, on the model's face, in place of each video of a person.
-
-    Args:
-        style: as :meth:`Animator.animate` takes it; other ones than words, paths and mixtures are returned as they are.
-        model: gives the model, an :class:`~facediff.Animator`, where there is a video.
-    """
+    """A style with a file of motion, on the model's face, in place of each video of a person."""
     if isinstance(style, Mapping):
         return {_motion(str(name), model): weight for name, weight in style.items()}
     if not isinstance(style, str | Path) or not str(style):
