@@ -8,10 +8,9 @@ from facediff.callbacks.dashboard import GradientNorm, RunDescription
 from facediff.callbacks.outputs import EpochLines, PredictionWriter, ScoreTable
 from facediff.callbacks.previews import SamplingPreview
 from facediff.callbacks.sounds import SpokenSoundsTerm
-from facediff.callbacks.speed import CompiledTraining, SpeechFeatureCache
+from facediff.callbacks.speed import SpeechFeatureCache
 
 __all__ = [
-    "CompiledTraining",
     "EmaWithWarmup",
     "EpochLines",
     "GradientNorm",

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -105,29 +104,6 @@ class SamplingPreview(Callback):
         self._chosen: list[str] = []
         self._tables: dict[int, Any] = {}
         self._scale = error_scale
-        self._drawn_epochs = 0
-        self._drawn_step = -1
-
-    @cached_property  # Lightning asks for it at every hook of every step
-    def state_key(self) -> str:
-        """Differs by the options, since several of these callbacks may be given."""
-        return self._generate_state_key(
-            every_n_epochs=self.every_n_epochs,
-            at_end=self.at_end,
-            clips=self.names or self.clips,
-            seconds=self.seconds,
-            size=self.size,
-            view=self.view,
-        )
-
-    def state_dict(self) -> dict[str, Any]:
-        """The error scale and the drawn previews, so that a resumed run continues with both."""
-        return {"error_scale": self._scale, "drawn_epochs": self._drawn_epochs, "drawn_step": self._drawn_step}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue from a checkpoint's state; an error scale given as an option takes precedence."""
-        self._scale = self.error_scale or state_dict["error_scale"]
-        self._drawn_epochs, self._drawn_step = state_dict["drawn_epochs"], state_dict["drawn_step"]
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Choose the clips, or report why there will be no preview."""
@@ -152,6 +128,10 @@ class SamplingPreview(Callback):
             self._warn(trainer, f"there are no validation clips in {data.root}")
         else:
             self._chosen = self.names or first_of_each_identity(clips, self.clips)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """A training that is resumed goes on counting epochs."""
+        self._drawn_epochs, self._drawn_step = trainer.current_epoch, -1
 
     def on_validation_batch_end(
         self,

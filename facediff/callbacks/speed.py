@@ -1,25 +1,19 @@
-"""Callbacks that make training quicker: cached speech features, and parts of the network compiled by PyTorch."""
+"""A callback that makes training quicker: cached speech features."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from torch import nn
 
 from facediff.callbacks.runs import require_facediff
 from facediff.data.dataset import CachedFeatures
-from facediff.errors import FaceDiffError, check_known
+from facediff.errors import FaceDiffError
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
 from facediff.utils.hints import checks_arguments
 from facediff.utils.progress import track
-
-Backend = Callable[..., Any]
-"""Your own compiler, as ``torch.compile`` takes it."""
 
 
 class SpeechFeatureCache(Callback):
@@ -64,66 +58,3 @@ class SpeechFeatureCache(Callback):
             features.put(clip, encoded[0, : int(lengths[0])])
         trainer.strategy.barrier("speech features")
         data.features.reader = features
-
-
-class CompiledTraining(Callback):
-    """Compiles parts of the network with ``torch.compile`` for the training steps.
-
-    Checkpoints are as without it: parts are compiled in place and keep their names. Validation, previews and everything
-    after training run the uncompiled parts. Each part is compiled once for all lengths of clips; the first steps wait
-    for that, a minute or so. Losses are the same but for rounding and dropout's random numbers.
-
-    Args:
-        parts: names of submodules of the model's network, such as ``decoder`` or ``style_encoder``.
-        backend: of ``torch.compile``. The usual one needs a C++ compiler on a processor, and
-            Triton and a C compiler on a GPU.
-    """
-
-    @checks_arguments
-    def __init__(self, parts: Sequence[str] = ("fusion", "decoder"), backend: str | Backend = "inductor") -> None:
-        self.parts = list(parts)
-        self.backend = backend
-        self._compiled: list[nn.Module] = []
-
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Find the parts."""
-        network = getattr(pl_module, "network", None) or nn.Module()
-        modules = dict(network.named_modules())
-        check_known("CompiledTraining.parts", "part of the network", self.parts, [*filter(None, modules)])
-        self._compiled = [modules[name] for name in self.parts]
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Mark the parts; each is compiled when it is first used."""
-        for part in self._compiled:
-            if part._compiled_call_impl is None:
-                part.compile(backend=self.backend, dynamic=True)
-
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Use the compiled parts again; a run that is resumed within an epoch begins without this hook."""
-        self.on_train_start(trainer, pl_module)
-
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Other callbacks that act when training has ended, such as a last preview, run the uncompiled parts."""
-        self._undo()
-
-    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Sampling runs a part on shapes of its own, and would compile it for each of them."""
-        self._undo()
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Use the compiled parts again."""
-        if self._compiled and not trainer.sanity_checking:
-            self.on_train_start(trainer, pl_module)
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave the model as it was."""
-        self._undo()
-        self._compiled = []
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Leave the model as it was, also after an interruption."""
-        self.on_fit_end(trainer, pl_module)
-
-    def _undo(self) -> None:
-        for part in self._compiled:
-            part._compiled_call_impl = None

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 class Command:
     """A subcommand and its line in the help.
 
-    The ``target``, ``module:function``, is imported only when the command is used. The function is typed and
+    The ``target``, ``module:function`` below ``facediff.cli``, is imported only when it is used. The function is typed and
     documented; its parser is made from that (:mod:`facediff.cli.parsing`). Functions called ``run`` or ``lightning``
     get the command's name and its arguments as they are.
 
@@ -44,86 +44,55 @@ class Command:
 
 COMMANDS = {
     "demo": Command(
-        "facediff.cli.demo:demo",
-        "make a corpus, train, test and render a talking face, in ten minutes",
-        "train,puppet,render",
+        "demo:demo", "make a corpus, train, test and render a talking face, in ten minutes", "train,puppet,render"
     ),
-    "animate": Command("facediff.cli.animate:animate", "animate a face with a recording of speech"),
-    "live": Command("facediff.cli.live:live", "animate live speech, and send it to engines and browsers"),
-    "person": Command("facediff.cli.track:person", "make a model of a person from a video", "prepare,render"),
-    "adapt": Command("facediff.cli.adapt:adapt", "fine-tune a trained model on a new speaker, or on other voices"),
-    "publish": Command(
-        "facediff.cli.publish:publish", "write a trained model as a folder for others, or send it to the hub"
-    ),
+    "animate": Command("animate:animate", "animate a face with a recording of speech"),
+    "live": Command("live:live", "animate live speech, and send it to engines and browsers"),
+    "person": Command("track:person", "make a model of a person from a video", "prepare,render"),
+    "adapt": Command("adapt:adapt", "fine-tune a trained model on a new speaker, or on other voices"),
+    "publish": Command("publish:publish", "write a trained model as a folder for others, or send it to the hub"),
     "export-model": Command(
-        "facediff.cli.export_model:export_model",
-        "write a trained model as a folder that animates without PyTorch",
-        "onnx",
+        "export_model:export_model", "write a trained model as a folder that animates without PyTorch", "onnx"
     ),
-    "serve": Command(
-        "facediff.cli.serve:serve", "serve a page on which an exported model animates in the browser", "serve"
-    ),
+    "serve": Command("serve:serve", "serve a page on which an exported model animates in the browser", "serve"),
     "import-checkpoint": Command(
-        "facediff.cli.import_checkpoint:import_checkpoint", "convert the checkpoint of a published method's authors"
+        "import_checkpoint:import_checkpoint", "convert the checkpoint of a published method's authors"
     ),
-    "style extract": Command("facediff.cli.style:extract", "write a speaking style as a style vector"),
-    "view": Command(
-        "facediff.cli.view:view", "write one HTML file that plays animations with their speech in any browser", "mesh"
-    ),
-    "export": Command(
-        "facediff.cli.export:export", "write animations for other programs: glb, USD, OBJ, point caches …", "mesh"
-    ),
-    "blendshapes": Command(
-        "facediff.cli.blendshapes:blendshapes", "write animations as weights of blendshapes (ARKit)", "mesh"
-    ),
-    "retarget": Command("facediff.cli.retarget:retarget", "transfer animations to another mesh", "mesh"),
-    "fit": Command("facediff.cli.lightning:lightning", "train a model"),
-    "validate": Command("facediff.cli.lightning:lightning", "score a model on the validation split"),
-    "test": Command("facediff.cli.lightning:lightning", "score a model on the test splits"),
-    "predict": Command("facediff.cli.lightning:lightning", "write a model's motion for a split"),
-    "evaluate": Command("facediff.cli.evaluate:evaluate", "score predicted motion files by named protocols"),
-    "benchmark": Command(
-        "facediff.cli.benchmark:benchmark", "train and score many methods, and write the tables", "train"
-    ),
-    "benchmark report": Command("facediff.cli.benchmark:report", "write the tables of benchmarks again", "train"),
+    "style extract": Command("style:extract", "write a speaking style as a style vector"),
+    "view": Command("view:view", "write one HTML file that plays animations with their speech in any browser", "mesh"),
+    "export": Command("export:export", "write animations for other programs: glb, USD, OBJ, point caches …", "mesh"),
+    "blendshapes": Command("blendshapes:blendshapes", "write animations as weights of blendshapes (ARKit)", "mesh"),
+    "retarget": Command("retarget:retarget", "transfer animations to another mesh", "mesh"),
+    "fit": Command("lightning:lightning", "train a model"),
+    "validate": Command("lightning:lightning", "score a model on the validation split"),
+    "test": Command("lightning:lightning", "score a model on the test splits"),
+    "predict": Command("lightning:lightning", "write a model's motion for a split"),
+    "evaluate": Command("evaluate:evaluate", "score predicted motion files by named protocols"),
+    "benchmark": Command("benchmark:benchmark", "train and score many methods, and write the tables"),
+    "benchmark report": Command("benchmark:report", "write the tables of benchmarks again"),
     "benchmark referee": Command(
-        "facediff.cli.referee:referee",
-        "compare models of any kind on one face, by phonemes",
-        "train,puppet",
+        "referee:referee", "compare models of any kind on one face, by phonemes", "train,puppet"
     ),
     "generation-metrics": Command(
-        "facediff.cli.generation_metrics:generation_metrics",
-        "diversity, liveliness and calibration of a model's samples",
+        "generation_metrics:generation_metrics", "diversity, liveliness and calibration of a model's samples"
     ),
-    "figure frames": Command("facediff.cli.figure:frames", "faces of truth and methods at chosen moments", "figures"),
-    "figure heatmap": Command("facediff.cli.figure:heatmap", "mean and deviation of motion at every vertex", "figures"),
-    "figure lips": Command("facediff.cli.figure:lips", "lip opening over time", "figures"),
-    "study make": Command(
-        "facediff.cli.study:make", "make a user study: videos side by side and a page of questions", "study"
-    ),
-    "study serve": Command("facediff.cli.study:serve", "serve a study's page, and store the answers", "study"),
-    "study report": Command(
-        "facediff.cli.study:report", "analyse the answers: preference, scores, agreement; plan", "study"
-    ),
-    "data prepare": Command("facediff.cli.data:run", "make a corpus folder from a raw distribution", "prepare"),
-    "data check": Command("facediff.cli.data:check", "recognise a folder, and report missing and wrong parts"),
-    "data pack": Command("facediff.cli.data:pack", "pack a corpus, for object storage and small disks", "packed"),
-    "data unpack": Command("facediff.cli.data:unpack", "write the corpus folder that a packed corpus holds", "packed"),
-    "data regions": Command("facediff.cli.data:regions", "draw a corpus's lips and upper face on its mesh"),
-    "data track": Command(
-        "facediff.cli.track:track", "make a corpus of people from their videos", "prepare,render,onnx"
-    ),
-    "data align": Command("facediff.cli.data:align", "find the phones of people's recordings, and cut them", "align"),
-    "data import-take": Command(
-        "facediff.cli.data:import_take", "make a recording of Live Link Face a corpus entry", "prepare"
-    ),
-    "data import-person": Command(
-        "facediff.cli.data:import_person", "make a reconstructed video a corpus entry", "prepare"
-    ),
-    "components": Command("facediff.cli.components:components", "list components and other names to choose from"),
-    "check-install": Command(
-        "facediff.cli.check_install:check_install", "print versions, devices and extras, and try the bundled model"
-    ),
+    "figure frames": Command("figure:frames", "faces of truth and methods at chosen moments", "figures"),
+    "figure heatmap": Command("figure:heatmap", "mean and deviation of motion at every vertex", "figures"),
+    "figure lips": Command("figure:lips", "lip opening over time", "figures"),
+    "study make": Command("study:make", "make a user study: videos side by side and a page of questions", "study"),
+    "study serve": Command("study:serve", "serve a study's page, and store the answers", "study"),
+    "study report": Command("study:report", "analyse the answers: preference, scores, agreement; plan", "study"),
+    "data prepare": Command("data:run", "make a corpus folder from a raw distribution", "prepare"),
+    "data check": Command("data:check", "recognise a folder, and report missing and wrong parts"),
+    "data pack": Command("data:pack", "pack a corpus, for object storage and small disks", "packed"),
+    "data unpack": Command("data:unpack", "write the corpus folder that a packed corpus holds", "packed"),
+    "data regions": Command("data:regions", "draw a corpus's lips and upper face on its mesh"),
+    "data track": Command("track:track", "make a corpus of people from their videos", "prepare,render,onnx"),
+    "data align": Command("data:align", "find the phones of people's recordings, and cut them", "align"),
+    "data import-take": Command("data:import_take", "make a recording of Live Link Face a corpus entry", "prepare"),
+    "data import-person": Command("data:import_person", "make a reconstructed video a corpus entry", "prepare"),
+    "components": Command("components:components", "list components and other names to choose from"),
+    "check-install": Command("check_install:check_install", "print versions and devices, and try the bundled model"),
 }
 HELP = ("-h", "--help")
 GROUPS = {
@@ -273,5 +242,5 @@ def load(name: str) -> Callable[..., int | None]:
             ) from error
         return installed
     module, _, function = COMMANDS[name].target.partition(":")
-    command: Callable[..., int | None] = getattr(importlib.import_module(module), function)
+    command: Callable[..., int | None] = getattr(importlib.import_module(f"facediff.cli.{module}"), function)
     return command

@@ -1,14 +1,12 @@
-"""``facediff check-install``: versions, devices and extras, and a trial of the bundled model."""
+"""``facediff check-install``: versions and devices, and a trial of the bundled model."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import os
 import platform
-import re
 import sys
 import time
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from facediff.cli.process import tell
@@ -19,16 +17,12 @@ if TYPE_CHECKING:
 
 PACKAGES = ("numpy", "onnxruntime", "torch", "torchmetrics", "lightning", "transformers", "scipy", "trimesh")
 """Packages with versions that a bug report needs."""
-GROUPS = ("all", "dev", "docs", "test", "cli", "audio", "runtime")
-"""Extras that are sums of others, of development, or a part of every installation."""
 SECONDS = 10
 """Length of the trial animation."""
 
-REQUIREMENT = re.compile(r"\s*([A-Za-z0-9._-]+)\s*(?:\[([^]]*)\])?[^;]*(?:;.*extra\s*==\s*['\"]([^'\"]+)['\"])?")
-
 
 def check_install() -> None:
-    """Print versions, devices and extras, and animate ten seconds with the bundled model.
+    """Print versions and devices, and animate ten seconds with the bundled model.
 
     Paste its output into a bug report. The exit status is 2 where the base installation does not work.
     """
@@ -39,11 +33,6 @@ def check_install() -> None:
     versions = {name: version for name in PACKAGES if (version := version_of(name))}
     tell("packages: " + ", ".join(f"{name} {version}" for name, version in versions.items()))
     tell(f"devices: {devices('torch' in versions)}")
-    lacking = {extra: list(missing(extra)) for extra in sorted(extras())}
-    tell("extras that are complete: " + (", ".join(extra for extra, names in lacking.items() if not names) or "none"))
-    for extra, names in lacking.items():
-        if names:
-            tell(f'  "{extra}" lacks {", ".join(names)}: pip install "facediff[{extra}]"')
     started = time.monotonic()
     try:
         animation = trial()
@@ -98,23 +87,3 @@ def devices(with_torch: bool) -> str:
         cards = ", ".join(torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count()))
         return f"{processors}, {cards} (CUDA {torch.version.cuda})"
     return f"{processors}, {'Apple MPS' if torch.backends.mps.is_available() else 'no graphics card for PyTorch'}"
-
-
-def extras() -> list[str]:
-    """The extras that bring a capability."""
-    declared = importlib.metadata.metadata("facediff").get_all("Provides-Extra") or []
-    return [extra for extra in declared if extra not in GROUPS]
-
-
-def missing(extra: str) -> Iterator[str]:
-    """Packages of an extra, and of the extras that it contains, that are not installed."""
-    for requirement in importlib.metadata.requires("facediff") or []:
-        match = REQUIREMENT.match(requirement)
-        if match is None or match[3] != extra:
-            continue
-        name, contained = match[1], match[2]
-        if name == "facediff":
-            for part in (contained or "").split(","):
-                yield from missing(part.strip())
-        elif version_of(name) is None:
-            yield name

@@ -21,7 +21,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.previews import borrowed, default_error_scale, first_of_each_identity, scores
+from facediff.callbacks.previews import borrowed, first_of_each_identity, scores
 from facediff.data import collate
 from facediff.data.corpus import Clip
 from facediff.models import DualPathDiffusion, load_model
@@ -171,11 +171,6 @@ def test_preview_clips_and_noise_are_the_same_in_every_epoch(
         trainer.fit(make_model(learning_rate=0.0), datamodule=tiny)
         one, two = sorted(folder.glob("previews/epoch_*/B_e05.png"))
         sheets += [np.asarray(Image.open(path)) for path in (one, two)]
-        assert preview.state_dict() == {
-            "error_scale": default_error_scale([tiny.dataset("val")[1]]),
-            "drawn_epochs": 2,
-            "drawn_step": 16,
-        }
         capture = cv2.VideoCapture(str(one.with_suffix(".mp4")))
         assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 10  # of 23
     panels = [sheet[20:60] for sheet in sheets]  # without the footer, where the epoch stands
@@ -200,15 +195,6 @@ def test_preview_is_drawn_when_it_is_due(
     assert epochs("d", {"max_epochs": 1, "limit_val_batches": 0}) == [1]
     assert epochs("e", {"fast_dev_run": True}) == []
     assert epochs("f", {"max_epochs": 0, "num_sanity_val_steps": 2}) == []
-
-
-def test_preview_state_is_resumed() -> None:
-    before, after, chosen = SamplingPreview(), SamplingPreview(), SamplingPreview(error_scale=2.0)
-    before.load_state_dict({"error_scale": 0.5, "drawn_epochs": 4, "drawn_step": 9})
-    after.load_state_dict(before.state_dict())
-    chosen.load_state_dict(before.state_dict())
-    assert after.state_dict() == {"error_scale": 0.5, "drawn_epochs": 4, "drawn_step": 9}
-    assert chosen.state_dict()["error_scale"] == 2.0
 
 
 def test_preview_that_fails_warns_and_leaves_nothing_half_written(

@@ -209,7 +209,7 @@ class Bench:
             torch.cuda.synchronize(self.device)
 
     def _compile(self, wanted: bool) -> None:
-        """What the callback CompiledTraining does, or the undoing of it."""
+        """Compile fusion and decoder, or undo it."""
         for part in (self.model.network.fusion, self.model.network.decoder):
             if wanted and part not in self._compiled:
                 part.compile(dynamic=True)
