@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 class Command:
     """A subcommand and its line in the help.
 
-    The ``target``, ``module:function`` below ``facediff.cli``, is imported only when it is used. The function is typed and
+    The ``target``, ``module:function`` in ``facediff.cli``, is imported only when it is used. The function is typed and
     documented; its parser is made from that (:mod:`facediff.cli.parsing`). Functions called ``run`` or ``lightning``
     get the command's name and its arguments as they are.
 
