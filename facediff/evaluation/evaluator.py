@@ -29,7 +29,7 @@ from facediff.evaluation.file_pairs import (
 )
 from facediff.evaluation.groups import attributes_of
 from facediff.evaluation.parameters import ParameterFiles, refuse_vertex_protocols
-from facediff.evaluation.report import EvaluationReport, MethodTable, runs_of
+from facediff.evaluation.report import EvaluationReport, MethodTable
 from facediff.evaluation.scoring import METRICS, Scorer, score_all
 from facediff.metrics import Context, EyelidPairs, LipPairs, Protocol, Region, protocol
 from facediff.metrics.by_name import parse_all
@@ -181,7 +181,6 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
     clips = {name_of_file(pair.truth.path) for table in tables for pair, _ in table.rows}
     attributes = attributes_of(scoring.corpus, clips, scoring.by) if scoring.by else {}
     by_name = {request.text: metrics[request.text] for request in parse_all(scoring.metrics)}
-    results = [table.result(sampling, attributes) for table in tables]
     return EvaluationReport(
         truth=str(truth),
         lips=scoring.lips,
@@ -193,8 +192,7 @@ def evaluate(methods: Mapping[str, str | Path], truth: str | Path, **options: An
         resamples=scoring.bootstrap,
         level=scoring.level,
         seed=scoring.seed,
-        methods=results,
-        runs=runs_of(results),
+        methods=[table.result(sampling, attributes) for table in tables],
         groups=[group for table in tables for group in table.groups(attributes)],
         comparisons=[row for table in tables[1:] for row in table.compare(tables[0], sampling)],
         unnamed_truths=unnamed_truths,

@@ -102,18 +102,6 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Runs:
-    """The scores of several training runs of one method: the other source of chance."""
-
-    methods: tuple[str, ...]  # the names under which the runs were given
-    seeds: tuple[int | None, ...]
-    protocol: str
-    metric: str
-    mean: float
-    deviation: float  # standard deviation between the runs (n − 1)
-
-
-@dataclass(frozen=True)
 class GroupScores:
     """The scores of one method over clips with equal attributes."""
 
@@ -143,7 +131,6 @@ class EvaluationReport:
     groups: list[GroupScores]  # scores by the attributes asked for, method by method
     unnamed_truths: list[str]  # files among the truths that do not fit the pattern
     remarks: list[str]  # whether the regions are those in use on the topology, if one was named
-    runs: list[Runs] = field(default_factory=list)  # of methods of which several training runs were given
     points: str = "vertices"  # in regions: vertices, or channels where only these are scored
 
     def regions(self) -> dict[str, dict[str, Any]]:
@@ -164,8 +151,6 @@ class EvaluationReport:
             "bootstrap": {"resamples": self.resamples, "level": self.level, "seed": self.seed},
             "methods": [asdict(method) for method in self.methods],
             "comparisons": [asdict(comparison) for comparison in self.comparisons],
-            "chance": {"sequences": "intervals and stars", "training_runs": "runs" if self.runs else "not known"},
-            "runs": [asdict(runs) for runs in self.runs],
             "groups": [asdict(group) for group in self.groups],
             "unnamed_truths": self.unnamed_truths,
         }
@@ -299,31 +284,6 @@ def same_method(one: Provenance | None, two: Provenance | None) -> bool:
     return one is not None and two is not None and one.checkpoint != two.checkpoint and one.same_method(two)
 
 
-def runs_of(methods: Sequence[MethodResult]) -> list[Runs]:
-    """Mean and deviation over the training runs of each method of which several were given."""
-    kinds: list[list[MethodResult]] = []
-    for method in methods:
-        kind = next((kind for kind in kinds if same_method(kind[0].provenance, method.provenance)), None)
-        if kind is None:
-            kinds.append([method])
-        else:
-            kind.append(method)
-    return [
-        _runs_of(kind, scores)
-        for kind in kinds
-        if len(kind) > 1
-        for scores in zip(*(method.scores for method in kind), strict=True)
-    ]
-
-
-def _runs_of(methods: Sequence[MethodResult], scores: Sequence[Score]) -> Runs:
-    """Mean and deviation of one score over the training runs of a method."""
-    values = np.array([score.value for score in scores])
-    names = tuple(method.name for method in methods)
-    seeds = tuple(method.provenance.seed for method in methods if method.provenance is not None)
-    return Runs(names, seeds, scores[0].protocol, scores[0].metric, float(values.mean()), float(values.std(ddof=1)))
-
-
 def _why_nothing(unscored: Missing) -> str:
     """The first reason why no clip of a method can be scored."""
     if unscored.unusable:
@@ -356,16 +316,13 @@ def text(report: EvaluationReport) -> str:
     lines += report.remarks
     for name in report.protocols:
         title = "further metrics" if name == METRICS else f"protocol {name}"
-        lines += ["", title, *_scores(report, name), *_runs(report, name), *_comparisons(report, name)]
-        lines += _groups(report, name)
+        lines += ["", title, *_scores(report, name), *_comparisons(report, name), *_groups(report, name)]
     if any(score.interval for method in report.methods for score in method.scores):
         lines += [
             "",
             f"[…]: {report.level:.0%} intervals, {report.resamples} bootstrap resamples of the sequences, "
             f"seed {report.seed}",
-            "they show the chance between sentences; the spread over training runs is separate"
-            if report.runs
-            else "they show the chance between sentences, not the chance between training runs",
+            "they show the chance between sentences, not the chance between training runs",
         ]
     lines += ["", *(_left_out(report) or ["every clip was scored; no frame was cut"])]
     lines = [printable(line) for line in lines]
@@ -442,16 +399,6 @@ def _comparisons(report: EvaluationReport, protocol: str) -> list[str]:
     same = dict.fromkeys(f"{one.method} and {one.baseline}" for one in comparisons if one.same_method)
     notes = [f"{pair} are training runs of one method: their difference is chance, and has no star" for pair in same]
     return [head, *_table(rows, ["sequences"]), *notes]
-
-
-def _runs(report: EvaluationReport, protocol: str) -> list[str]:
-    """Mean ± standard deviation over the training runs of a method."""
-    rows: Rows = {}
-    for runs in report.runs:
-        if runs.protocol == protocol:
-            cell = f"{runs.mean:.4e} ± {runs.deviation:.1e}"
-            rows.setdefault(", ".join(runs.methods), {}).update({runs.metric: cell, "runs": str(len(runs.methods))})
-    return ["over training runs (mean ± standard deviation)", *_table(rows, ["runs"])] if rows else []
 
 
 def _cell(value: float, interval: Interval | None, sign: str = "") -> str:

@@ -99,10 +99,10 @@ class Scorer:
         truth_stride: 2 takes every second frame of the truth, and so on.
         metrics: further metrics by name, made for the corpus.
         inputs: gives their inputs of a clip besides its motion.
-        moments: in which frames a metric of that name is taken, where not in all.
+        moments: in which frames a metric of that name is taken.
         owners: protocol and label of each of these that a protocol names.
         read: reads a file, every ``stride``-th frame of it; None for files of vertices.
-        channels: regions ``lips`` and ``upper_face`` of channels, for protocols of channels.
+        channels: regions ``lips`` and ``upper_face`` of channels, for protocols of channels; None for vertices.
         scales: factor of lengths of each protocol, by its name.
     """
 
@@ -114,24 +114,21 @@ class Scorer:
         upper_face: Region | None,
         templates: Mapping[str, Tensor],
         n_vertices: int,
-        truth_stride: int = 1,
-        metrics: Mapping[str, Metric] | None = None,
-        inputs: Callable[[Pair], dict[str, Any]] = lambda _: {},
-        moments: Mapping[str, Moment] | None = None,
-        owners: Mapping[str, tuple[str, str]] | None = None,
-        read: Callable[[Path, int], Motion] | None = None,
-        channels: Mapping[str, Region] | None = None,
-        scales: Mapping[str, float] | None = None,
+        truth_stride: int,
+        metrics: Mapping[str, Metric],
+        inputs: Callable[[Pair], dict[str, Any]],
+        moments: Mapping[str, Moment],
+        owners: Mapping[str, tuple[str, str]],
+        read: Callable[[Path, int], Motion] | None,
+        channels: Mapping[str, Region] | None,
+        scales: Mapping[str, float],
     ) -> None:
         self.columns: list[Column] = []
         self.metrics: dict[str, SequenceMetric] = {}
-        self.templates = templates
-        self.n_vertices = n_vertices
-        self.truth_stride = truth_stride
+        self.templates, self.n_vertices, self.truth_stride = templates, n_vertices, truth_stride
         self.remarks: list[str] = []
         self.read = read or self._read
-        self.moments = dict(moments or {})
-        self.owners = dict(owners or {})
+        self.moments = moments
         for protocol in protocols:
             with errors_of(f"protocol {protocol.name}"):
                 if protocol.channels:
@@ -139,20 +136,17 @@ class Scorer:
                         raise ValueError("it scores channels, and the files hold vertices")
                     built = protocol.build(channels["lips"], channels["upper_face"])
                 else:
-                    built = protocol.build(lips, upper_face, scale=(scales or {}).get(protocol.name, 1.0))
+                    built = protocol.build(lips, upper_face, scale=scales[protocol.name])
                     for region in (built.lips, built.upper):
                         if region is not None:
                             region.check(n_vertices)
             self.remarks += [remark for remark in built.summary().remarks if remark not in self.remarks]
             for name, metric in built.scores().items():
                 self._add(protocol, name, metric)
-        self.needs_template = read is None and any(
-            isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values()
-        )
-        if self.needs_template and not templates:
+        has_fdd = any(isinstance(metric, FaceDynamicsDeviation) for metric in self.metrics.values())
+        if read is None and has_fdd and not templates:
             raise FaceDiffError("FDD needs each speaker's neutral face: give --templates, or a protocol without FDD")
-        self.further = dict(metrics or {})
-        self.inputs = inputs
+        self.further, self.inputs = metrics, inputs
         for name, further in self.further.items():
             over = further.over if isinstance(further, SequenceMetric) else None
             of_channels = bool(getattr(further, "of_channels", False))
@@ -162,12 +156,11 @@ class Scorer:
             pooling: Pooling = getattr(further, "pooling", "sequences")
             where = "all vertices" if over is None else over.as_dict()
             better = describe_column(further)["better"]
-            protocol_name, label = self.owners.get(name, (METRICS, name))
+            protocol_name, label = owners.get(name, (METRICS, name))
             facts: dict[str, Any] = {"region": where, "better": better, "channels": of_channels, "by_name": True}
             self.columns.append(Column(protocol_name, label, pooling, "min", name, **facts))
-        self.needs_template |= read is None and any(
-            "template" in getattr(further, "needs", ()) for further in self.further.values()
-        )
+        has_template = any("template" in getattr(further, "needs", ()) for further in metrics.values())
+        self.needs_template = read is None and (has_fdd or has_template)
 
     def _add(self, protocol: Protocol, name: str, metric: SequenceMetric) -> None:
         finish: Callable[[Tensor], Tensor] | None = None
@@ -290,7 +283,6 @@ class Scorer:
         )
 
     def _read(self, path: Path, stride: int) -> Motion:
-        """A file of vertices."""
         return Motion(read_vertices(path, self.n_vertices, stride))
 
     def _values(self, clips: Clips, metrics: Mapping[str, SequenceMetric]) -> dict[str, float]:
