@@ -224,7 +224,7 @@ DRILLS = [
     Drill("data regions", f"corpus --corpus {TINY} --size 64 -o a.png", f"corpus --corpus {TINY} --size 80 -o a.png"),
     Drill(
         "data import-person",
-        "person.npy --audio person.wav --name Target --frame-rate 30 --corpus persons --quiet -o entry",
+        "person.npy --audio person.wav --name Target --frame-rate 30 --corpus persons -o entry",
         once=True,
     ),
     Drill("data import-take", "take.csv person.wav --name Target --offset 0 -o entry", once=True),

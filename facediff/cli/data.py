@@ -281,20 +281,17 @@ def unpack(packed: Packed, out: NewFolder, *, work: WorkOptions) -> None:
 
 
 def import_person(
-    motion: Annotated[Path, Option(metavar="MOTION", reads=True, exists="file or folder")],
+    motion: Annotated[Path, Option(metavar="MOTION", reads=True, exists="file")],
     *,
     audio: File = None,
     name: str,
     corpus: Annotated[Path, Option(metavar="ROOT", reads=True, exists="folder")],
     output: OutputFolder,
     frame_rate: FrameRate = None,
-    corpus_frame_rate: FrameRate = None,
     template: File = None,
     stable: FileOrList = None,
     flame: Annotated[Path | None, Option(metavar="MODEL", reads=True)] = None,
-    scale: Annotated[ranges.Factor | None, Option(metavar="FACTOR")] = None,
     clip_seconds: Annotated[ranges.ClipLength, Option(metavar="S")] = 8.0,
-    quiet: bool = False,
 ) -> None:
     """Turn the 3D reconstruction of one person's video, or for a corpus of people the video, into a corpus entry.
 
@@ -302,23 +299,19 @@ def import_person(
     from it.
 
     Args:
-        motion: folder of .obj or .ply files, one a frame; .npy of (frames, vertices, 3) or (frames, 3 vertices);
-            FLAME parameters: shape_pose_cam.hdf5, or .npy of (1, frames, 403); or a video, which is tracked as by
-            `facediff data track`
+        motion: .npy of (frames, vertices, 3) or (frames, 3 vertices); FLAME parameters: shape_pose_cam.hdf5, or .npy
+            of (1, frames, 403); or a video, which is tracked as by `facediff data track`
         audio: the video, or its sound; not for a video
         name: the person's name: letters, digits, dashes
         corpus: corpus of other speakers with the same topology
         output: folder to make
         frame_rate: frames a second of MOTION; not for a video
-        corpus_frame_rate: frames a second of the corpus; needed if ROOT has no manifest.json that says it
-        template: neutral face (.obj, .ply, .npy) in MOTION's unit (default: the median of frames in which the person
-            is silent and still)
+        template: neutral face (.npy) in MOTION's unit (default: the median of frames in which the person is silent
+            and still)
         stable: text file with the indices of vertices that move with the skull only, or FLAME_masks.pkl:scalp+forehead
             (default: the vertices that move least)
         flame: your FLAME model file, for FLAME parameters
-        scale: corpus units to a unit of MOTION, e.g. 0.001 (default: measured)
         clip_seconds: approximate length of a clip
-        quiet: no progress bar
     """
     from facediff.data.corpus import read_manifest
     from facediff.data.person import import_person as import_motion
@@ -330,9 +323,7 @@ def import_person(
         tell(*import_video(motion, name, corpus, output, clip_seconds).lines())
         return
     if audio is None or frame_rate is None:
-        raise FaceDiffError(
-            "--audio, --frame-rate: are needed for meshes, arrays and parameters; only a video has both"
-        )
+        raise FaceDiffError("--audio, --frame-rate: are needed for arrays and parameters; only a video has both")
     report = import_motion(
         motion,
         audio=audio,
@@ -340,13 +331,10 @@ def import_person(
         corpus=corpus,
         output=output,
         frame_rate=frame_rate,
-        corpus_frame_rate=corpus_frame_rate,
         template=template,
         stable=stable,
         flame=flame,
-        scale=scale,
         clip_seconds=clip_seconds,
-        progress=not quiet and sys.stderr.isatty(),
     )
     tell(f"{output}: {report.name}", *report.lines(read_manifest(output).get("unit")))
 

@@ -124,33 +124,6 @@ def write_auxiliary(root: Path, *, manifest: bool = True, rate: float = RATE) ->
     return root
 
 
-def write_objs(folder: Path, frames: npt.NDArray[np.floating], *, name: str = "frame_{:d}.obj") -> Path:
-    """One OBJ a frame, as many tools write it: texture coordinates, groups, no leading zeros in the number."""
-    folder.mkdir()
-    corners = "\n".join(f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in grid_faces() + 1)
-    texture = "\n".join("vt 0.5 0.5" for _ in range(VERTICES))
-    for number, vertices in enumerate(frames, start=1):
-        points = "\n".join("v {:.6f} {:.6f} {:.6f}".format(*vertex) for vertex in vertices)
-        text = f"# made by a tool\nmtllib face.mtl\n{points}\n{texture}\ng face\n{corners}\n"
-        (folder / name.format(number)).write_text(text)
-    return folder
-
-
-def write_plys(folder: Path, frames: npt.NDArray[np.floating]) -> Path:
-    """One binary PLY a frame: float32 vertices, faces of uchar and int."""
-    folder.mkdir()
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {VERTICES}\nproperty float x\nproperty float y\n"
-        f"property float z\nelement face {len(grid_faces())}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    corners = np.empty(len(grid_faces()), [("count", "u1"), ("index", "<i4", 3)])
-    corners["count"], corners["index"] = 3, grid_faces()
-    for number, vertices in enumerate(frames):
-        data = header.encode() + vertices.astype("<f4").tobytes() + corners.tobytes()
-        (folder / f"{number:06d}.ply").write_bytes(data)
-    return folder
-
-
 def write_speech(path: Path, seconds: float, *, rate: int = 44100) -> Path:
     """The speech in stereo at another rate."""
     time = np.arange(round(seconds * rate)) / rate

@@ -1,4 +1,4 @@
-"""Fitting a speaker into a corpus: head motion, neutral face, and the way into the corpus's coordinates."""
+"""Fitting a speaker into a corpus: reading the motion, head motion, neutral face, and the way into its coordinates."""
 
 from __future__ import annotations
 
@@ -10,24 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.data.corpus import LIP_PAIRS, MOTION_FOLDERS, find_region, read_manifest, read_templates
-from facediff.data.person.face_sequences import (
-    MESHES,
-    Array,
-    Faces,
-    FaceSequence,
-    differing_faces,
-    scratch_array,
-    spans,
-)
+from facediff.data.reconstructions import read_parameters
 from facediff.data.track.face import pair_distances
-from facediff.errors import FaceDiffError, OptionError
-from facediff.mesh import Similarity, face_size, median_face, read_mesh, remove_rigid_motion, robust_align
-from facediff.mesh.alignment import chunks
+from facediff.errors import FaceDiffError
+from facediff.mesh import Similarity, face_size, median_face, remove_rigid_motion, robust_align
+from facediff.mesh.alignment import Indices, chunks
+from facediff.mesh.flame import Flame
 from facediff.metrics import LipPairs
 from facediff.speech.audio import SAMPLE_RATE
-from facediff.utils.arrays import open_array
-from facediff.utils.numerics import Indices
+from facediff.utils.arrays import open_array, vertices_of
+from facediff.utils.files import reserve_room
+from facediff.utils.hdf5 import HDF5_SUFFIXES
 
+Array = npt.NDArray[np.float64]
 Speech = npt.NDArray[np.float32]
 
 RESIDUAL_LIMIT = 0.15
@@ -36,7 +31,6 @@ RESIDUAL_LIMIT = 0.15
 Faces of different speakers differ by some hundredths; vertices in another order by about 1.
 """
 SAME_UNIT = 1.2  # a speaker's face and the corpus's mean face differ in size by less than this factor
-MOST_SCALED = 3.0  # a scale that is given makes a face at most so many times larger or smaller than the corpus's
 MIN_STABLE = 10
 STILL = 1e-6  # of the face's size: slower motion counts as none
 SAME_SIZE = 1.1  # template and motion must agree in size to this factor
@@ -45,6 +39,7 @@ NEUTRAL_SHARE = 0.05  # share of the frames that the neutral face is the median 
 CLOSED = 0.012  # gap of closed lips as a share of the face's size, about 1 mm
 CLOSED_SHARE = 1 / 3  # of the frames with closed lips
 NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
+FLAME_FRAMES = 64  # frames that the FLAME layer works on at a time
 
 
 # The corpus that the speaker is to join: its topology, coordinates and frame rate.
@@ -52,71 +47,84 @@ NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
 
 @dataclass(frozen=True)
 class TargetCorpus:
-    """The properties that a new speaker must match: mean (V, 3) of the templates, triangles (F, 3), rate, unit."""
+    """The properties that a new speaker must match: mean (V, 3) of the templates, rate, unit."""
 
     root: Path
     mean: Array
-    faces: Faces | None
     frame_rate: float
     unit: str | None
-    lip_pairs: Indices | None = None  # (P, 2) upper and lower vertices of the inner lips
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of its topology."""
-        return len(self.mean)
+    lip_pairs: Indices | None  # (P, 2) upper and lower vertices of the inner lips
 
 
-def read_target_corpus(root: Path, *, name: str, frame_rate: float | None) -> TargetCorpus:
-    """Read the corpus that a speaker joins; ``frame_rate`` is needed where ``manifest.json`` does not record it."""
+def read_target_corpus(root: Path, name: str) -> TargetCorpus:
+    """Read the corpus that a speaker of a new name joins."""
     templates = read_templates(root / "templates.pkl")
     stems = {path.stem for folder in MOTION_FOLDERS for path in (root / folder).glob("*.npy")}
     subjects = {*templates, *(stem.rpartition("_")[0] for stem in stems)}
     if name.casefold() in {subject.casefold() for subject in subjects}:
         raise FaceDiffError(f"--name {name}: {root} has a speaker of that name already; choose another name")
     manifest = read_manifest(root)
-    unit = manifest.get("unit")
-    mean: Array = np.stack([template.numpy() for template in templates.values()]).astype(np.float64).mean(axis=0)
+    if not (rate := manifest.get("frame_rate")):
+        raise FaceDiffError(
+            f'{root / "manifest.json"}: has no frame rate; write the corpus\'s, such as {{"frame_rate": 25}}'
+        )
+    pairs = root / LIP_PAIRS
     return TargetCorpus(
         root,
-        mean,
-        _corpus_faces(root, len(mean)),
-        _frame_rate(root, manifest.get("frame_rate"), frame_rate),
-        unit if isinstance(unit, str) else None,
-        np.array(LipPairs.from_file(root / LIP_PAIRS).pairs) if (root / LIP_PAIRS).is_file() else None,
+        np.stack([template.numpy() for template in templates.values()]).astype(np.float64).mean(axis=0),
+        float(rate),
+        manifest.get("unit"),
+        np.array(LipPairs.from_file(pairs).pairs) if pairs.is_file() else None,
     )
 
 
-def _frame_rate(root: Path, recorded: float | None, option: float | None) -> float:
-    if (rate := recorded or option) is None or abs(rate - (option or rate)) > 1e-6:
+# The motion of a speaker: vertices, or FLAME parameters.
+
+
+@dataclass(frozen=True)
+class FaceSequence:
+    """A sequence of faces as read."""
+
+    frames: npt.NDArray[np.floating]  # (T, V, 3), usually memory-mapped
+    template: Array | None = None  # (V, 3) neutral face, where the source has one
+
+    @property
+    def has_head_motion(self) -> bool:
+        """Whether the head moves: FLAME parameters are read without their head pose."""
+        return self.template is None
+
+
+def read_motion(path: Path, n_vertices: int, scratch: Path, flame: Path | None) -> FaceSequence:
+    """Read a .npy array of vertices, or FLAME parameters by the model file ``flame``, into a temporary file."""
+    if flame is not None:
+        parameters, layer = read_parameters(path), Flame.read(flame)
+        template = np.asarray(layer.shaped(parameters.shape), np.float64)
+        if len(template) != n_vertices:
+            raise FaceDiffError(
+                f"{flame}: has {len(template)} vertices, but the corpus has {n_vertices}; so its topology is not FLAME"
+            )
+        frames = scratch_array(scratch, (len(parameters.expression), n_vertices, 3))
+        for first in range(0, len(frames), FLAME_FRAMES):
+            part = slice(first, first + FLAME_FRAMES)
+            frames[part] = layer.vertices(parameters.shape, parameters.expression[part], parameters.jaw[part])
+        return FaceSequence(frames, template)
+    array = np.empty(0) if path.suffix.lower() in HDF5_SUFFIXES else open_array(path, kinds="f")
+    if vertices_of(array.shape) != n_vertices:
         raise FaceDiffError(
-            f"--corpus-frame-rate {option or 'is missing'}: {root / 'manifest.json'} has {recorded or 'none'}; "
-            f"expected the frame rate of the corpus in one of them"
+            f"{path}: has shape {array.shape}; expected (frames, {n_vertices}, 3) or (frames, {3 * n_vertices}) like "
+            f"the corpus, or FLAME parameters with --flame MODEL"
         )
-    return float(rate)
+    return FaceSequence(array.reshape(len(array), n_vertices, 3))
 
 
-def _corpus_faces(root: Path, n_vertices: int) -> Faces | None:
-    """Faces of the first mesh in the folder or in ``templates/`` that has the right vertex count."""
-    for folder in (root, root / "templates"):
-        for path in sorted(folder.glob("*")):
-            if path.suffix.lower() in MESHES and path.is_file():
-                mesh = read_mesh(path, points_allowed=True)
-                if len(mesh.vertices) == n_vertices and len(mesh.faces):
-                    return mesh.faces
-    return None
+def scratch_array(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    """A new memory-mapped float32 array."""
+    array: npt.NDArray[np.float32] = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+    reserve_room(path)
+    return array
 
 
-def check_faces(path: Path, faces: Faces | None, target: TargetCorpus) -> bool:
-    """Whether faces could be compared with the corpus's; an error if they differ."""
-    if faces is None or target.faces is None:
-        return False
-    if differing := differing_faces(faces, target.faces):
-        raise FaceDiffError(
-            f"{path}: {differing} triangles are not those of the mesh in {target.root}, so the topology differs; if "
-            f"only polygons were triangulated differently, give the motion as a .npy array, which has no faces"
-        )
-    return True
+# The way into the corpus's coordinates.
 
 
 def lay_onto_corpus(path: Path, face: Array, target: TargetCorpus) -> tuple[Similarity, float]:
@@ -136,24 +144,17 @@ def relative_residual(face: Array, target: Array) -> float:
     return float(np.sqrt(np.square(face - target).sum(axis=-1).mean())) / face_size(target)
 
 
-def into_coordinates(face: Array, best: Similarity, fixed_scale: float | None) -> Similarity:
+def into_coordinates(face: Array, best: Similarity) -> Similarity:
     """The similarity that takes a speaker into the corpus's coordinates.
 
     Its scale changes the unit and keeps the speaker's size: where the measured scale is near a power of ten
     (millimetres, centimetres, metres), it is that power; else, as with a corpus of normalised size, it is as measured.
     ``best`` lays the speaker's neutral face onto the corpus's mean face best, and is kept but for its scale, about the
-    face's centre; a scale that is given is used instead.
+    face's centre.
     """
-    if fixed_scale is not None and not abs(math.log(fixed_scale / best.scale)) < math.log(MOST_SCALED):
-        raise OptionError(
-            "scale",
-            f"makes a face {fixed_scale / best.scale:.3g} times as large as the corpus's; expected corpus units to a "
-            f"unit of the motion, about {best.scale:.3g} by the size of the face",
-            f"{fixed_scale:g}",
-        )
     power = round(math.log10(best.scale))
     is_unit = abs(math.log10(best.scale) - power) < math.log10(SAME_UNIT)
-    scale = fixed_scale if fixed_scale is not None else 10.0**power if is_unit else best.scale
+    scale = 10.0**power if is_unit else best.scale
     centre = face.mean(axis=0)
     return Similarity(best.rotation, best.apply(centre) - scale * best.rotation @ centre, scale)
 
@@ -243,14 +244,6 @@ def _speed(frames: npt.NDArray[np.floating]) -> Array:
 
 
 @dataclass(frozen=True)
-class TemplateFile:
-    """A neutral face (V, 3) that was given, and its file."""
-
-    path: Path
-    vertices: Array
-
-
-@dataclass(frozen=True)
 class NeutralFace:
     """A neutral face (V, 3)."""
 
@@ -263,14 +256,14 @@ class NeutralFace:
 def choose_neutral(
     motion: FaceSequence,
     stabilised: StabilisedMotion,
-    template: TemplateFile | None,
-    speech: npt.NDArray[np.float32],
+    template: Path | None,
+    speech: Speech,
     frame_rate: float,
     lip_pairs: Indices | None = None,
 ) -> NeutralFace:
     """The neutral face that was given, else the source's own, else one found in the frames without head motion."""
     if template is not None:
-        return NeutralFace(template.vertices, _onto_template(stabilised, template), str(template.path))
+        return _given(stabilised, template)
     unmoved = Similarity(np.eye(3), np.zeros(3))
     if motion.template is not None:
         return NeutralFace(motion.template, unmoved, "the model's shape without expression")
@@ -284,36 +277,24 @@ def choose_neutral(
     return NeutralFace(face, unmoved, source, frames)
 
 
-def _onto_template(stabilised: StabilisedMotion, template: TemplateFile) -> Similarity:
-    """The rigid motion from the stabilised frames to a template, by the stable vertices."""
-    face, target = stabilised.face[stabilised.stable], template.vertices[stabilised.stable]
+def _given(stabilised: StabilisedMotion, path: Path) -> NeutralFace:
+    """A neutral face from .npy, and the rigid motion from the stabilised frames to it, by the stable vertices."""
+    template = np.array(open_array(path, kinds="f"), np.float64).reshape(-1, 3)
+    if template.shape != stabilised.face.shape or not np.isfinite(template).all():
+        raise FaceDiffError(
+            f"{path}: has {len(template)} vertices, or NaN among them; expected {len(stabilised.face)} finite ones"
+        )
+    face, target = stabilised.face[stabilised.stable], template[stabilised.stable]
     ratio = robust_align(face, target, scale=True).scale
     rigid = robust_align(face, target)
-    residual = relative_residual(rigid.apply(stabilised.face), template.vertices)
+    residual = relative_residual(rigid.apply(stabilised.face), template)
     if not abs(math.log(max(ratio, 1e-9))) < math.log(SAME_SIZE) or not residual < RESIDUAL_LIMIT:
         raise FaceDiffError(
-            f"{template.path}: is {ratio:.4g} times as large as the faces of the motion, and does not lie on them "
+            f"{path}: is {ratio:.4g} times as large as the faces of the motion, and does not lie on them "
             f"(residual {residual:.2f} of its size, expected less than {RESIDUAL_LIMIT}); expected the speaker's "
             f"neutral face in the motion's own unit and vertex order"
         )
-    return rigid
-
-
-def read_template(path: Path, target: TargetCorpus) -> TemplateFile:
-    """A neutral face from .obj, .ply or .npy."""
-    faces: Faces | None = None
-    if path.suffix.lower() in MESHES:
-        mesh = read_mesh(path, points_allowed=True)
-        vertices, faces = mesh.vertices, mesh.faces if len(mesh.faces) else None
-    else:
-        vertices = np.array(open_array(path, kinds="f"), np.float64).reshape(-1, 3)
-    if len(vertices) != target.n_vertices or not np.isfinite(vertices).all():
-        raise FaceDiffError(
-            f"{path}: has {len(vertices)} vertices, or NaN among them; expected {target.n_vertices} finite ones like "
-            f"the corpus, from .obj, .ply or .npy"
-        )
-    check_faces(path, faces, target)
-    return TemplateFile(path, vertices)
+    return NeutralFace(template, rigid, str(path))
 
 
 def loudness(speech: Speech, frames: int, frame_rate: float, smoothing: float = SMOOTHING) -> Array:
@@ -344,3 +325,19 @@ def neutral_frames(loud: Array, speed: Array, gaps: Array | None = None, closed:
     share = NEUTRAL_SHARE if gaps is None else CLOSED_SHARE
     count = min(len(frames), int(np.clip(round(share * len(frames)), *NEUTRAL_FRAMES)))
     return np.sort(frames[np.argsort(ranks, kind="stable")[:count]])
+
+
+def spans(numbers: list[int]) -> str:
+    """Sorted whole numbers in short: ``3-7, 12``; an ellipsis after ten spans.
+
+    >>> spans([3, 4, 5, 12])
+    '3-5, 12'
+    """
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    texts = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
+    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "…"])

@@ -9,30 +9,26 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.data.manifest import FORMAT
-from facediff.data.person.face_sequences import Array, FaceSequence, read_motion, scratch_array
 from facediff.data.person.fitting import (
-    NeutralFace,
+    Array,
     Speech,
-    StabilisedMotion,
-    TargetCorpus,
-    check_faces,
     choose_neutral,
     into_coordinates,
     lay_onto_corpus,
     loudness,
     middle_face,
+    read_motion,
     read_stable,
     read_target_corpus,
-    read_template,
+    scratch_array,
     stabilise,
 )
 from facediff.data.preparation import MANIFEST, version, write_clip, write_templates
 from facediff.data.reconstructions import resample_frames, resampled_length
 from facediff.errors import FaceDiffError, counted, damaged
-from facediff.mesh import Similarity, stable_vertices
+from facediff.mesh import stable_vertices
 from facediff.mesh.alignment import chunks
 from facediff.speech.audio import SAMPLE_RATE, fit_length, read_speech, samples_for
 from facediff.utils import ranges
@@ -56,105 +52,89 @@ def import_person(
     corpus: Path,
     output: Path,
     frame_rate: ranges.FrameRate,
-    corpus_frame_rate: ranges.FrameRate | None = None,
     template: Path | None = None,
     stable: str | None = None,
     flame: Path | None = None,
-    scale: ranges.Factor | None = None,
     clip_seconds: ranges.ClipLength = 8.0,
-    progress: bool = False,
 ) -> ImportReport:
     """Turn the reconstruction of one speaker's video into a corpus entry that fits an existing corpus.
 
     Args:
-        motion: folder of .obj or .ply files, .npy of vertices, or FLAME parameters (.hdf5, .npy).
+        motion: .npy of vertices, or FLAME parameters (.hdf5, .npy).
         audio: the video, or its sound.
         name: the speaker's name, without underscore.
         corpus: folder of the corpus that the speaker is to join.
         output: folder to make.
         frame_rate: frames per second of the motion.
-        corpus_frame_rate: frames per second of the corpus, where its manifest does not record it.
-        template: neutral face (.obj, .ply, .npy) in the motion's unit; found in the motion if None.
+        template: neutral face (.npy) in the motion's unit; found in the motion if None.
         stable: file of the vertices that move with the skull only; found in the motion if None.
         flame: FLAME model file, for FLAME parameters.
-        scale: corpus units to a unit of the motion; measured if None.
         clip_seconds: approximate length of the clips.
-        progress: whether to show a progress bar.
 
     Returns:
         the report of the import.
     """
     output = check_entry(name, output)
-    target = read_target_corpus(corpus, name=name, frame_rate=corpus_frame_rate)
+    target = read_target_corpus(corpus, name)
     speech = read_entry_speech(audio)
     with scratch_folder(output) as scratch:
-        read = read_motion(
-            motion,
-            n_vertices=target.n_vertices,
-            frame_rate=frame_rate,
-            scratch=scratch / "read.npy",
-            flame=flame,
-            progress=progress,
-        )
+        read = read_motion(motion, len(target.mean), scratch / "read.npy", flame)
         warnings = _check_lengths(motion, audio, len(speech), len(read.frames), frame_rate)
-        fitted = _fit(motion, read, target, speech, frame_rate, scratch, template=template, stable=stable, scale=scale)
-        frames, to_corpus = fitted.stabilised.frames, fitted.neutral.placing.then(fitted.to_corpus)
+        skull = None if stable is None else read_stable(stable, len(target.mean))
+        with damaged(motion, "get the motion again"):
+            for _ in chunks(read.frames):
+                pass  # refuses frames that are not finite
+            still = stable_vertices(read.frames) if skull is None else skull
+            face = middle_face(read, still)
+            lay_onto_corpus(motion, face, target)  # another topology is refused before the long work
+            stabilised = stabilise(read, face, still, scratch / "stable.npy")
+        with damaged(template or motion, "choose another neutral face"):
+            neutral = choose_neutral(read, stabilised, template, speech, frame_rate, target.lip_pairs)
+            best, residual = lay_onto_corpus(template or motion, neutral.face, target)
+        to_corpus = into_coordinates(neutral.face, best)
+        frames, whole = stabilised.frames, neutral.placing.then(to_corpus)
         for part, chunk in chunks(frames):
-            frames[part] = to_corpus.apply(chunk)
+            frames[part] = whole.apply(chunk)
         if frame_rate != target.frame_rate:
             length = resampled_length(len(frames), frame_rate, target.frame_rate)
             resampled = scratch_array(scratch / "rate.npy", (length, *frames.shape[1:]))
             frames = resample_frames(frames, frame_rate, target.frame_rate, out=resampled)
         clips = cut(name, speech, len(frames), target.frame_rate, clip_seconds)
-        mismatch = len(speech) / SAMPLE_RATE - len(read.frames) / frame_rate
-        report = _report(name, read, target, fitted, clips, frame_rate, stable, mismatch, warnings)
+        report = ImportReport(
+            name=name,
+            frames=len(read.frames),
+            seconds=len(read.frames) / frame_rate,
+            frame_rate=frame_rate,
+            corpus_frame_rate=target.frame_rate,
+            has_head_motion=read.has_head_motion,
+            rotation_max=float(np.degrees(stabilised.turns.max())),
+            rotation_rms=float(np.degrees(_rms(stabilised.turns))),
+            translation_max=to_corpus.scale * float(stabilised.shifts.max()),
+            translation_rms=to_corpus.scale * _rms(stabilised.shifts),
+            stable_vertices=len(still),
+            stable_source="found to move least" if stable is None else f"of {stable}",
+            jitter=to_corpus.scale * stabilised.jitter,
+            scale=to_corpus.scale,
+            measured_scale=best.scale,
+            topology_residual=residual,
+            template_source=neutral.source,
+            template_frames=neutral.frames,
+            mismatch=len(speech) / SAMPLE_RATE - len(read.frames) / frame_rate,
+            clips=len(clips),
+            splits=dict(Counter(clip.split for clip in clips)),
+            frames_written=clips[-1].stop,
+            warnings=warnings,
+        )
         entry = scratch / output.name
-        _write_entry(entry, target, clips, frames, speech, fitted.to_corpus.apply(fitted.neutral.face), report)
+        for clip in clips:
+            first = samples_for(clip.start, target.frame_rate)
+            part = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)
+            write_clip(entry, clip.name, frames[clip.start : clip.stop], part)
+        write_templates(entry / "templates.pkl", {name: to_corpus.apply(neutral.face).astype(np.float32)})
+        fields = {"frame_rate": target.frame_rate, "n_vertices": len(target.mean), "unit": target.unit}
+        write_entry_manifest(entry, name, clips, fields, asdict(report))
         put_in_place(entry, output, replace=False)
     return report
-
-
-@dataclass(frozen=True)
-class FittedSpeaker:
-    """A speaker's frames on the way into the corpus."""
-
-    stabilised: StabilisedMotion  # frames without head motion, still in the motion's coordinates
-    neutral: NeutralFace
-    to_corpus: Similarity  # from the neutral face's coordinates to the corpus's
-    measured_scale: float  # scale of the best similarity between the neutral face and the corpus's mean face
-    residual: float  # what that similarity leaves, as a share of the face's size
-    faces_compared: bool
-
-
-def _fit(
-    motion: Path,
-    read: FaceSequence,
-    target: TargetCorpus,
-    speech: Speech,
-    frame_rate: float,
-    scratch: Path,
-    *,
-    template: Path | None,
-    stable: str | None,
-    scale: float | None,
-) -> FittedSpeaker:
-    """Remove the head's motion, find the neutral face, and find the way into the corpus's coordinates."""
-    template_file = None if template is None else read_template(template, target)
-    skull = None if stable is None else read_stable(stable, target.n_vertices)
-    compared = check_faces(motion, read.faces, target)
-    with damaged(motion, "get the motion again"):
-        for _ in chunks(read.frames):
-            pass  # refuses frames that are not finite
-        still = stable_vertices(read.frames) if skull is None else skull
-        face = middle_face(read, still)
-        lay_onto_corpus(motion, face, target)  # another topology is refused before the long work
-        stabilised = stabilise(read, face, still, scratch / "stable.npy")
-    source = template or motion
-    with damaged(source, "choose another neutral face"):
-        neutral = choose_neutral(read, stabilised, template_file, speech, frame_rate, target.lip_pairs)
-        best, residual = lay_onto_corpus(source, neutral.face, target)
-    to_corpus = into_coordinates(neutral.face, best, scale)
-    return FittedSpeaker(stabilised, neutral, to_corpus, best.scale, residual, compared)
 
 
 def check_entry(name: str, output: Path) -> Path:
@@ -274,7 +254,6 @@ class ImportReport:
     scale: float  # corpus units to a unit of the motion, as used
     measured_scale: float  # the same, as measured between the speaker's neutral face and the corpus's mean face
     topology_residual: float  # residual between these two faces, as a share of the face's size
-    faces_compared: bool
     template_source: str  # how the neutral face was obtained
     template_frames: list[int]  # the frames it is the median of; empty if it was given
     mismatch: float  # seconds by which the sound is longer than the motion (negative: shorter)
@@ -282,7 +261,6 @@ class ImportReport:
     splits: dict[str, int]
     frames_written: int
     warnings: list[str] = field(default_factory=list)  # what the user should check
-    notes: list[str] = field(default_factory=list)  # other remarks
 
     def lines(self, unit: str | None) -> list[str]:
         """The report as lines of text.
@@ -293,7 +271,6 @@ class ImportReport:
         of = unit or "corpus units"
         clips = counted(self.clips, "clip")
         splits = ", ".join(f"{count} {split}" for split, count in self.splits.items())
-        compared = "triangles equal" if self.faces_compared else "triangles not compared"
         stable = f"{self.stable_vertices} vertices {self.stable_source}, which jitter by {self.jitter:.3g} {of} RMS"
         head = [
             ("rotation removed", f"at most {self.rotation_max:.3f}°, RMS {self.rotation_rms:.3f}°"),
@@ -305,7 +282,7 @@ class ImportReport:
             *(head if self.has_head_motion else none),
             ("stable vertices", stable),
             ("scale", f"{self.scale:.6g} (measured {self.measured_scale:.6g})"),
-            ("topology", f"residual {self.topology_residual:.3f} of the face's size, {compared}"),
+            ("topology", f"residual {self.topology_residual:.3f} of the face's size"),
             ("template", self.template_source),
             (
                 "sound and motion",
@@ -315,76 +292,12 @@ class ImportReport:
         ]
         return [
             *(f"{title:<21}{text}" for title, text in rows),
-            *(f"note: {note}" for note in self.notes),
             *(f"warning: {warning}" for warning in self.warnings),
         ]
 
 
-def _report(
-    name: str,
-    read: FaceSequence,
-    target: TargetCorpus,
-    fitted: FittedSpeaker,
-    clips: list[EntryClip],
-    frame_rate: float,
-    stable: str | None,
-    mismatch: float,
-    warnings: list[str],
-) -> ImportReport:
-    stabilised, scale = fitted.stabilised, fitted.to_corpus.scale
-    return ImportReport(
-        name=name,
-        frames=len(read.frames),
-        seconds=len(read.frames) / frame_rate,
-        frame_rate=frame_rate,
-        corpus_frame_rate=target.frame_rate,
-        has_head_motion=read.has_head_motion,
-        rotation_max=float(np.degrees(stabilised.turns.max())),
-        rotation_rms=float(np.degrees(_rms(stabilised.turns))),
-        translation_max=scale * float(stabilised.shifts.max()),
-        translation_rms=scale * _rms(stabilised.shifts),
-        stable_vertices=len(stabilised.stable),
-        stable_source="found to move least" if stable is None else f"of {stable}",
-        jitter=scale * stabilised.jitter,
-        scale=scale,
-        measured_scale=fitted.measured_scale,
-        topology_residual=fitted.residual,
-        faces_compared=fitted.faces_compared,
-        template_source=fitted.neutral.source,
-        template_frames=fitted.neutral.frames,
-        mismatch=mismatch,
-        clips=len(clips),
-        splits=dict(Counter(clip.split for clip in clips)),
-        frames_written=clips[-1].stop,
-        warnings=warnings,
-        notes=read.notes,
-    )
-
-
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.square(values).mean()))
-
-
-# The files.
-
-
-def _write_entry(
-    folder: Path,
-    target: TargetCorpus,
-    clips: Sequence[EntryClip],
-    frames: npt.NDArray[np.floating],
-    speech: Speech,
-    template: Array,
-    report: ImportReport,
-) -> None:
-    """Write clips, template and manifest in the layout that every corpus has."""
-    for clip in clips:
-        first = samples_for(clip.start, target.frame_rate)
-        part = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)
-        write_clip(folder, clip.name, frames[clip.start : clip.stop], part)
-    write_templates(folder / "templates.pkl", {report.name: template.astype(np.float32)})
-    fields = {"frame_rate": target.frame_rate, "n_vertices": target.n_vertices, "unit": target.unit}
-    write_entry_manifest(folder, report.name, clips, fields, asdict(report))
 
 
 def write_entry_manifest(

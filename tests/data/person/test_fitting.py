@@ -10,7 +10,6 @@ import pytest
 
 from facediff.data.corpus import read_manifest
 from facediff.data.person import import_person
-from facediff.data.person.face_sequences import differing_faces, find_frames
 from facediff.data.person.fitting import loudness, neutral_frames
 from facediff.data.person.importer import cut_points, splits
 from facediff.errors import FaceDiffError
@@ -18,32 +17,6 @@ from facediff.mesh.flame import Flame
 from facediff.utils.pickles import load_pickle
 from tests.fakes.flame import flame_arrays, write_flame
 from tests.fakes.person import RATE, loud, speech, write_speech
-
-
-def touch(folder: Path, *names: str) -> Path:
-    for name in names:
-        (folder / name).touch()
-    return folder
-
-
-def test_files_are_put_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    folder = touch(tmp_path, "take2_10.obj", "take2_9.obj", "take2_0008.OBJ", "take2_12.ply", "._take2_9.obj", "a.txt")
-    files = find_frames(folder)
-    assert [path.name for path in files.paths] == ["take2_0008.OBJ", "take2_9.obj", "take2_10.obj", "take2_12.ply"]
-    assert (files.frames, files.numbers) == ([0, 1, 2, 4], [8, 9, 10, 12])
-    assert files.missing() == [(2, 4)]
-
-
-def test_equal_steps_are_no_gaps(tmp_path: Path) -> None:
-    files = find_frames(touch(tmp_path, *(f"{2 * i:05d}.ply" for i in range(5, 12))))
-    assert (files.frames, files.missing()) == (list(range(7)), [])
-
-
-def test_faces_are_compared_as_sets_of_triangles() -> None:
-    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2]])
-    assert differing_faces(faces, np.array([[2, 3, 4], [2, 0, 1], [1, 3, 2]])) == 0
-    assert differing_faces(faces, np.array([[2, 3, 4], [2, 0, 1], [1, 3, 4]])) == 2
-    assert differing_faces(faces, faces[:2]) == 1
 
 
 def test_loudness_is_the_root_mean_square_around_a_frame() -> None:
