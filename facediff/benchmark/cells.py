@@ -38,49 +38,29 @@ Kind = Literal["fit", "checkpoint", "predictions"]
 
 @dataclass(frozen=True)
 class Training:
-    """A run of ``facediff fit``.
+    """A run of ``facediff fit``."""
 
-    Attributes:
-        name: of the step, ``fit`` for the last one.
-        config: the experiment config.
-        options: of the command line, by name without dashes.
-    """
-
-    name: str
-    config: Path
-    options: Options
+    name: str  # of the step, ``fit`` for the last one
+    config: Path  # the experiment config
+    options: Options  # of the command line, by name without dashes
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One training run of one row on one corpus, or one set of predictions.
-
-    Attributes:
-        row: name of the row.
-        corpus: the plan's name of the corpus.
-        seed: of the training; None where the plan does not train.
-        kind: whether it is trained, or a checkpoint, or predictions.
-        trainings: in this order.
-        source: the checkpoint, or the folder of predictions.
-        options: of ``facediff evaluate``, for predictions.
-        test_options: of ``facediff test``.
-        root: the corpus's folder where the plan names it.
-        data: config of the data module where the plan names it.
-        recipe: everything that the result depends on, as plain data.
-        trained: the part of the recipe that the trained weights depend on.
-    """
+    """One training run of one row on one corpus, or one set of predictions."""
 
     row: str
-    corpus: str
-    seed: int | None
-    kind: Kind
-    trainings: tuple[Training, ...] = ()
-    source: Path | None = None
-    options: Options = field(default_factory=dict)
-    test_options: Options = field(default_factory=dict)
-    root: Path | None = None
-    data: Path | None = None
-    recipe: Mapping[str, Any] = field(default_factory=dict)
+    corpus: str  # the plan's name of the corpus
+    seed: int | None  # of the training; None where the plan does not train
+    kind: Kind  # whether it is trained, or a checkpoint, or predictions
+    trainings: tuple[Training, ...] = ()  # in this order
+    source: Path | None = None  # the checkpoint, or the folder of predictions
+    options: Options = field(default_factory=dict)  # of ``facediff evaluate``, for predictions
+    test_options: Options = field(default_factory=dict)  # of ``facediff test``
+    root: Path | None = None  # the corpus's folder where the plan names it
+    data: Path | None = None  # config of the data module where the plan names it
+    recipe: Mapping[str, Any] = field(default_factory=dict)  # everything that the result depends on, as plain data
+    # The part of the recipe that the trained weights depend on
     trained: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:

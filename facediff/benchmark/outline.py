@@ -21,35 +21,20 @@ FileName = Annotated[str, Text(r"(?!\.{0,2}$)[^/\\]+", "a file's name")]
 
 @dataclass(frozen=True)
 class ReportOutline:
-    """The part of a plan that reports need, as plain data in the benchmark's folder.
-
-    Attributes:
-        name: of the plan.
-        title: of the tables.
-        description: a sentence about them.
-        protocol: by which all was scored.
-        columns: scores and :data:`~facediff.benchmark.plan.COSTS` that are shown; all scores if none is named, and all
-            costs.
-        baseline: the row that others are compared with; the first if empty.
-        references: rows that were not trained.
-        rows: label, and name in papers' tables, by row.
-        corpora: label by corpus.
-        published: names of papers' tables.
-        cells: files of results by row and corpus, in the order of the plan.
-        command: that made it.
-    """
+    """The part of a plan that reports need, as plain data in the benchmark's folder."""
 
     name: FileName
     title: str
     description: str
-    protocol: str
+    protocol: str  # by which all was scored
+    # Scores and :data:`~facediff.benchmark.plan.COSTS` that are shown; all scores if none is named, and all costs
     columns: tuple[str, ...]
-    baseline: str
-    references: tuple[str, ...]
-    rows: Mapping[str, tuple[str, str]]
-    corpora: Mapping[str, str]
-    published: tuple[str, ...]
-    cells: tuple[FileName, ...]
+    baseline: str  # the row that others are compared with; the first if empty
+    references: tuple[str, ...]  # rows that were not trained
+    rows: Mapping[str, tuple[str, str]]  # label, and name in papers' tables, by row
+    corpora: Mapping[str, str]  # label by corpus
+    published: tuple[str, ...]  # names of papers' tables
+    cells: tuple[FileName, ...]  # files of results by row and corpus, in the order of the plan
     command: str = ""
 
 

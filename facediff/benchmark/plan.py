@@ -46,20 +46,12 @@ Count = Annotated[int, Range(1, 1024)]
 
 @dataclass(frozen=True)
 class CorpusEntry:
-    """A corpus of the plan.
+    """A corpus of the plan."""
 
-    Attributes:
-        label: by which tables call it.
-        data: config of its data module; None where experiment configs have their own.
-        root: its folder; None for the place that the data module knows.
-        options: of every training on it.
-        name: by which the plan calls it.
-    """
-
-    label: Line = ""
-    data: Annotated[Path, PATH] | None = None
-    root: Annotated[Path, PATH] | None = None
-    options: Options = field(default_factory=dict)
+    label: Line = ""  # by which tables call it
+    data: Annotated[Path, PATH] | None = None  # config of its data module; None where experiment configs have their own
+    root: Annotated[Path, PATH] | None = None  # its folder; None for the place that the data module knows
+    options: Options = field(default_factory=dict)  # of every training on it
     name: str = field(default="", metadata=DERIVED)
 
 
@@ -73,34 +65,19 @@ class Before:
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """A row of the table, or one for each variant.
-
-    Attributes:
-        label: by which tables call it.
-        config: experiment config that trains it; ``{corpus}`` stands for the corpus's name.
-        checkpoint: a trained model, one for each seed if it has ``{seed}``.
-        predictions: a folder of predicted motion, with the same fields in its path.
-        options: of the training, or of ``facediff evaluate`` for predictions.
-        test_options: of the test.
-        before: trainings that come first, by name.
-        published: its name in tables of papers.
-        corpora: those that it is run on; all if None.
-        seeds: instead of the plan's.
-        variants: names of the plan's variants that it is run in; all if None.
-        name: by which the plan calls it.
-    """
+    """A row of the table, or one for each variant."""
 
     label: Line = ""
-    config: FilePath | None = None
-    checkpoint: FilePath | None = None
-    predictions: FilePath | None = None
-    options: Options = field(default_factory=dict)
-    test_options: Options = field(default_factory=dict)
-    before: Mapping[Name, Before] = field(default_factory=dict)
-    published: Line = ""
-    corpora: Lines | None = None
-    seeds: Seeds | None = None
-    variants: Lines | None = None
+    config: FilePath | None = None  # experiment config that trains it; ``{corpus}`` stands for the corpus's name
+    checkpoint: FilePath | None = None  # a trained model, one for each seed if it has ``{seed}``
+    predictions: FilePath | None = None  # a folder of predicted motion, with the same fields in its path
+    options: Options = field(default_factory=dict)  # of the training, or of ``facediff evaluate`` for predictions
+    test_options: Options = field(default_factory=dict)  # of the test
+    before: Mapping[Name, Before] = field(default_factory=dict)  # trainings that come first, by name
+    published: Line = ""  # its name in tables of papers
+    corpora: Lines | None = None  # those that it is run on; all if None
+    seeds: Seeds | None = None  # instead of the plan's
+    variants: Lines | None = None  # names of the plan's variants that it is run in; all if None
     name: str = field(default="", metadata=DERIVED)
 
     @property

@@ -19,46 +19,27 @@ FILE = Path(__file__).with_name("published.yaml")
 
 @dataclass(frozen=True)
 class Published:
-    """A table of a paper.
+    """A table of a paper."""
 
-    Attributes:
-        name: by which plans call it.
-        source: paper and table.
-        corpus: the corpus's name.
-        split: the split that was scored.
-        protocol: the named protocol that its figures follow.
-        rows: scores by the paper's name of the method.
-        lips: number of lip vertices; None if it is not said.
-        frames: that were scored; None if the paper does not say.
-        sequences: that were scored; None if the paper does not say.
-        doubt: why its figures cannot be compared with any others; empty if they can.
-    """
-
-    name: str
-    source: str
+    name: str  # by which plans call it
+    source: str  # paper and table
     corpus: str
     split: str
-    protocol: str
-    rows: Mapping[str, Mapping[str, float]]
-    lips: int | None = None
-    frames: int | None = None
-    sequences: int | None = None
-    doubt: str = ""
+    protocol: str  # the named protocol that its figures follow
+    rows: Mapping[str, Mapping[str, float]]  # scores by the paper's name of the method
+    lips: int | None = None  # number of lip vertices; None if it is not said
+    frames: int | None = None  # that were scored; None if the paper does not say
+    sequences: int | None = None  # that were scored; None if the paper does not say
+    doubt: str = ""  # why its figures cannot be compared with any others; empty if they can
 
 
 @dataclass(frozen=True)
 class PublishedScores:
-    """Figures of papers next to a table of ours.
+    """Figures of papers next to a table of ours."""
 
-    Attributes:
-        scores: the printed figures, by row and score.
-        sources: their papers and tables.
-        reasons: why tables that a plan names are not shown.
-    """
-
-    scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    sources: tuple[str, ...] = ()
-    reasons: tuple[str, ...] = ()
+    scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # the printed figures, by row and score
+    sources: tuple[str, ...] = ()  # their papers and tables
+    reasons: tuple[str, ...] = ()  # why tables that a plan names are not shown
 
 
 @cache

@@ -39,19 +39,12 @@ Ideal = Literal["higher", "lower", "zero", "one"]
 
 @dataclass(frozen=True)
 class RefereeScore:
-    """A column.
-
-    Attributes:
-        title: in tables.
-        ideal: which way is better; None where nothing is better or worse.
-        digits: decimals.
-        meaning: its definition.
-    """
+    """A column."""
 
     title: str
-    ideal: Ideal | None
+    ideal: Ideal | None  # which way is better; None where nothing is better or worse
     digits: int
-    meaning: str
+    meaning: str  # its definition
 
     def badness(self, value: float) -> float:
         """How bad a value is: smaller is better."""
@@ -255,17 +248,11 @@ def wrong_sentence(motion: SpokenMotion, substitute: SpokenMotion, _frame_rate: 
 
 @dataclass(frozen=True)
 class PlantedFault:
-    """A fault and the scores that must detect it.
+    """A fault and the scores that must detect it."""
 
-    Attributes:
-        title: of its row.
-        spoil: makes it.
-        seen_by: scores that must be worse than the sound model's.
-    """
-
-    title: str
-    spoil: Fault
-    seen_by: tuple[str, ...]
+    title: str  # of its row
+    spoil: Fault  # makes it
+    seen_by: tuple[str, ...]  # scores that must be worse than the sound model's
 
 
 FAULTS = {
@@ -295,26 +282,18 @@ class FaultVerdict:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A row of the report, with the scores of its planted faults.
-
-    Attributes:
-        name: of the model.
-        scores: by name, as far as there are any; ``closures_de`` and so on by language.
-        faults: the scores of each planted fault.
-        facts: how it was put on the open face, its licence and so on, by title.
-        seconds: of the processor for a second of speech; None if not measured.
-        memory: bytes at most; None if not known.
-        problem: why there are no scores; empty if there are.
-    """
+    """A row of the report, with the scores of its planted faults."""
 
     name: str
+    # By name, as far as there are any; ``closures_de`` and so on by language
     scores: Mapping[str, float] = field(default_factory=dict)
-    faults: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    faults: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # the scores of each planted fault
+    # How it was put on the open face, its licence and so on, by title
     facts: Mapping[str, str] = field(default_factory=dict)
-    seconds: float | None = None
-    memory: float | None = None
+    seconds: float | None = None  # of the processor for a second of speech; None if not measured
+    memory: float | None = None  # bytes at most; None if not known
     frame_rate: float = 25.0
-    problem: str = ""
+    problem: str = ""  # why there are no scores; empty if there are
 
     def seen(self) -> list[FaultVerdict]:
         """The verdict of each score on the faults that it must detect, where it has a value."""

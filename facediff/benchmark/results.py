@@ -47,47 +47,31 @@ class Rows:
 
 @dataclass(frozen=True)
 class Result:
-    """The result of a cell.
-
-    Attributes:
-        row: name of the row.
-        corpus: the plan's name of the corpus.
-        seed: of the training; None if nothing was trained.
-        kind: ``fit``, ``checkpoint`` or ``predictions``.
-        key: hash of the cell's recipe.
-        config: hash of the training without its seed.
-        problem: why the cell failed; empty if it did not.
-        code: version, and commit of a checkout.
-        source: the checkpoint or the folder that was scored.
-        provenance: the training run, as plain data; empty where it is not known.
-        synthetic: whether a program made the corpus.
-        protocol: of the scores.
-        definition: of each number, in words.
-        machine: processor, GPU and versions.
-        measured: seconds and bytes of memory of each step.
-        columns: how each score is pooled, and which way it is better.
-        scores: a row for each split and method (``model``, ``still``, ``mean_face``, ``shuffled``), with regions,
-            frames and sequences.
-        sequences: a row for each split, method and clip.
-    """
+    """The result of a cell."""
 
     row: str
-    corpus: str
+    corpus: str  # the plan's name of the corpus
     seed: int | None
-    kind: str
-    key: str
-    config: str = ""
-    problem: str = ""
-    code: Mapping[str, str] = field(default_factory=dict)
-    source: str = ""
+    kind: str  # ``fit``, ``checkpoint`` or ``predictions``
+    key: str  # hash of the cell's recipe
+    config: str = ""  # hash of the training without its seed
+    problem: str = ""  # why the cell failed; empty if it did not
+    code: Mapping[str, str] = field(default_factory=dict)  # version, and commit of a checkout
+    source: str = ""  # the checkpoint or the folder that was scored
+    # The training run, as plain data; empty where it is not known
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    synthetic: bool = False
-    protocol: str = ""
-    definition: str = ""
-    machine: Mapping[str, Any] = field(default_factory=dict)
+    synthetic: bool = False  # whether a program made the corpus
+    protocol: str = ""  # of the scores
+    definition: str = ""  # of each number, in words
+    machine: Mapping[str, Any] = field(default_factory=dict)  # processor, GPU and versions
+    # Seconds and bytes of memory of each step
     measured: Mapping[str, Mapping[str, Annotated[float, Range(0, 1e18)] | None]] = field(default_factory=dict)
+    # How each score is pooled, and which way it is better
     columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
+    # A row for each split and method (``model``, ``still``, ``mean_face``, ``shuffled``), with regions, frames and
+    # sequences
     scores: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method")] = ()
+    # A row for each split, method and clip
     sequences: Annotated[Sequence[Mapping[str, Any]], Rows("split", "method", "clip")] = ()
     name: str = ""
 

@@ -42,32 +42,24 @@ REPORT = Path("version_0", "test_report.json")
 
 @dataclass(frozen=True)
 class Setting:
-    """The settings that all cells of a run share.
+    """The settings that all cells of a run share."""
 
-    Attributes:
-        folder: the benchmark's folder.
-        protocol: of all scores.
-        metrics: further metrics.
-        weights: ``last`` or ``best``.
-        threads: of each process.
-        clips: split of each clip, by the plan's name of a corpus, where predictions are scored.
-        truths: arguments of `facediff evaluate` for the truth (folder, frame stride), by corpus.
-        classes: data module of each corpus that is no part of facediff, which a checkpoint may not import by itself.
-        models: class of each trained row's model that is no part of facediff, for the same reason.
-        roots: folders of corpora by the data config, for checkpoints without one of this machine.
-        launcher: how a facediff command is started.
-    """
-
-    folder: Path
-    protocol: str
-    metrics: tuple[str, ...]
-    weights: str
-    threads: int
+    folder: Path  # the benchmark's folder
+    protocol: str  # of all scores
+    metrics: tuple[str, ...]  # further metrics
+    weights: str  # ``last`` or ``best``
+    threads: int  # of each process
+    # Split of each clip, by the plan's name of a corpus, where predictions are scored
     clips: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    # Arguments of `facediff evaluate` for the truth (folder, frame stride), by corpus
     truths: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    # Data module of each corpus that is no part of facediff, which a checkpoint may not import by itself
     classes: Mapping[str, str] = field(default_factory=dict)
+    # Class of each trained row's model that is no part of facediff, for the same reason
     models: Mapping[str, str] = field(default_factory=dict)
+    # Folders of corpora by the data config, for checkpoints without one of this machine
     roots: Mapping[str, str] = field(default_factory=dict)
+    # How a facediff command is started
     launcher: tuple[str, ...] = (sys.executable, "-m", "facediff.benchmark.exit_with_parent", "facediff")
 
 

@@ -20,17 +20,12 @@ from facediff.reporting.statistics import Array, Bootstrap, Interval, holm, sign
 
 @dataclass(frozen=True)
 class RowScores:
-    """One score of one row.
+    """One score of one row."""
 
-    Attributes:
-        runs: the score of each training run (runs,).
-        table: a row a sentence, a column a training run; None if the score is no mean over sentences.
-        fixed: whether nothing was trained, so that there is no chance between runs.
-    """
-
-    runs: Array
+    runs: Array  # the score of each training run (runs,)
+    # A row a sentence, a column a training run; None if the score is no mean over sentences
     table: ScoreMatrix | None = None
-    fixed: bool = False
+    fixed: bool = False  # whether nothing was trained, so that there is no chance between runs
 
     @property
     def mean(self) -> float:
@@ -66,27 +61,17 @@ def shares(table: ScoreMatrix) -> Array:
 
 @dataclass(frozen=True)
 class Difference:
-    """One row's score minus another's.
+    """One row's score minus another's."""
 
-    Attributes:
-        value: the difference of the means over runs, over the sentences of which both have a value.
-        sentences: bootstrap interval over sentences; None if there is none.
-        p_sentences: of the permutation test over sentences; None if the score is no mean over sentences.
-        runs: interval over training runs (Welch); None if the chance between runs is not known.
-        p_runs: of Welch's test; None as for ``runs``.
-        total: interval over sentences and training runs together; None if the chance between runs is not known.
-        p: of the test with both chances; None as for ``total``, and where the score has no chance.
-        common: sentences with a value in both rows.
-    """
-
-    value: float
-    sentences: Interval | None
-    p_sentences: float | None
-    runs: Interval | None
-    p_runs: float | None
+    value: float  # the difference of the means over runs, over the sentences of which both have a value
+    sentences: Interval | None  # bootstrap interval over sentences; None if there is none
+    p_sentences: float | None  # of the permutation test over sentences; None if the score is no mean over sentences
+    runs: Interval | None  # interval over training runs (Welch); None if the chance between runs is not known
+    p_runs: float | None  # of Welch's test; None as for ``runs``
+    # Interval over sentences and training runs together; None if the chance between runs is not known
     total: Interval | None
-    p: float | None
-    common: int
+    p: float | None  # of the test with both chances; None as for ``total``, and where the score has no chance
+    common: int  # sentences with a value in both rows
 
 
 def difference(one: RowScores, baseline: RowScores, bootstrap: Bootstrap) -> Difference:

@@ -42,31 +42,19 @@ class Cost:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of a table.
+    """A row of a table."""
 
-    Attributes:
-        name: by which the plan calls it.
-        label: by which the table calls it.
-        seeds: of its training runs.
-        reference: whether it is none of the compared methods.
-        scores: by column.
-        intervals: over sentences, by column.
-        marks: ``best`` or ``second``, by column.
-        differences: from the baseline, with the corrected p-value, by column.
-        cost: speed and size.
-        clips: sentences that it was scored on.
-    """
-
-    name: str
-    label: str
-    seeds: tuple[int | None, ...]
-    reference: bool
-    scores: Mapping[str, RowScores]
-    intervals: Mapping[str, Interval | None]
-    marks: Mapping[str, str] = field(default_factory=dict)
+    name: str  # by which the plan calls it
+    label: str  # by which the table calls it
+    seeds: tuple[int | None, ...]  # of its training runs
+    reference: bool  # whether it is none of the compared methods
+    scores: Mapping[str, RowScores]  # by column
+    intervals: Mapping[str, Interval | None]  # over sentences, by column
+    marks: Mapping[str, str] = field(default_factory=dict)  # ``best`` or ``second``, by column
+    # From the baseline, with the corrected p-value, by column
     differences: Mapping[str, tuple[Difference, float | None]] = field(default_factory=dict)
     cost: Cost = Cost()
-    clips: int = 0
+    clips: int = 0  # sentences that it was scored on
 
     def significant(self, column: str, level: float) -> bool:
         """Whether the difference from the baseline is larger than chance explains."""

@@ -35,23 +35,15 @@ def holds_parameters(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class ParameterFiles:
-    """How files of one evaluation are read.
+    """How files of one evaluation are read."""
 
-    Attributes:
-        space: the truth's, with the order of channels in all scores.
-        frame_rate: of the truth as it is scored.
-        layouts: of the predictions' and of the truth's arrays; None for files that name their channels.
-        truth: folder of the truth.
-        rig: decodes channels to vertices; None where only channels are scored.
-        predictions: folders of the predictions, which may lie in the truth's.
-    """
-
-    space: Space
-    frame_rate: float
+    space: Space  # the truth's, with the order of channels in all scores
+    frame_rate: float  # of the truth as it is scored
+    # Of the predictions' and of the truth's arrays; None for files that name their channels
     layouts: tuple[str | None, str | None]
-    truth: Path
-    rig: AnyRig | None = None
-    predictions: tuple[Path, ...] = ()
+    truth: Path  # folder of the truth
+    rig: AnyRig | None = None  # decodes channels to vertices; None where only channels are scored
+    predictions: tuple[Path, ...] = ()  # folders of the predictions, which may lie in the truth's
 
     @classmethod
     def begin(

@@ -62,21 +62,14 @@ class Bullets:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table with the first column aligned to the left.
-
-    Attributes:
-        head: titles of the columns.
-        rows: cells.
-        marks: ``best`` or ``second``, by row and column.
-        references: numbers of the rows that are set apart from the compared ones; they stand last.
-        caption: below the table in LaTeX.
-    """
+    """A table with the first column aligned to the left."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[object]]
-    marks: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    marks: Mapping[tuple[int, int], str] = field(default_factory=dict)  # ``best`` or ``second``, by row and column
+    # Numbers of the rows that are set apart from the compared ones; they stand last
     references: frozenset[int] = frozenset()
-    caption: str = ""
+    caption: str = ""  # below the table in LaTeX
 
     def cells(self, form: str, escape: Callable[[object], str]) -> list[list[str]]:
         """The cells of a form, escaped and with their marks."""

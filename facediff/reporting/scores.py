@@ -12,17 +12,11 @@ from facediff.reporting.statistics import Array, Bootstrap, Interval, pooled
 
 @dataclass(frozen=True)
 class ScoreMatrix:
-    """Scores of clips, and their weights.
-
-    Attributes:
-        clips: names of the rows.
-        values: (clips, columns), 0 where there is none.
-        weights: (clips, columns): frames where all frames count alike, else 1; 0 where there is no value.
-    """
+    """Scores of clips, and their weights."""
 
     clips: tuple[str, ...]
-    values: Array
-    weights: Array
+    values: Array  # (clips, columns), 0 where there is none
+    weights: Array  # (clips, columns): frames where all frames count alike, else 1; 0 where there is no value
 
     @classmethod
     def of(cls, clips: Sequence[str], values: Array, weights: Array) -> ScoreMatrix:

@@ -28,46 +28,27 @@ Comments = Mapping[str, Annotated[str, Text(expected=f"at most {LONGEST_COMMENT}
 
 @dataclass(frozen=True)
 class Answer:
-    """A rater's answers to one video.
+    """A rater's answers to one video."""
 
-    Attributes:
-        trial: the trial's id.
-        answers: the answer to each question: ``left``, ``right`` or ``same``.
-        seconds: from when the video was shown to when the answers were given.
-        plays: how often the video was played.
-        at: when, in UTC.
-    """
-
-    trial: str
+    trial: str  # the trial's id
     answers: Mapping[str, str]
-    seconds: Annotated[float, Range(0, 1e7)]
-    plays: Annotated[int, Range(0, 1_000_000)]
-    at: Time
+    seconds: Annotated[float, Range(0, 1e7)]  # from when the video was shown to when the answers were given
+    plays: Annotated[int, Range(0, 1_000_000)]  # how often the video was played
+    at: Time  # when, in UTC
 
 
 @dataclass(frozen=True)
 class Rater:
-    """A rater and all of their answers.
+    """A rater and all of their answers."""
 
-    Attributes:
-        token: a random number.
-        number: chooses the schedule.
-        language: of the page.
-        code: given by the people who run the study, or empty.
-        started: when, in UTC.
-        finished: when; None if the rater has not finished.
-        answers: by trial, in the order in which they were given.
-        comments: texts by question.
-    """
-
-    token: str
-    number: int
+    token: str  # a random number
+    number: int  # chooses the schedule
     language: str
-    code: str
-    started: str
-    finished: str | None = None
-    answers: Mapping[str, Answer] = field(default_factory=dict)
-    comments: Mapping[str, str] = field(default_factory=dict)
+    code: str  # given by the people who run the study, or empty
+    started: str  # when, in UTC
+    finished: str | None = None  # when; None if the rater has not finished
+    answers: Mapping[str, Answer] = field(default_factory=dict)  # by trial, in the order in which they were given
+    comments: Mapping[str, str] = field(default_factory=dict)  # texts by question
 
 
 @dataclass(frozen=True)

@@ -79,25 +79,16 @@ class Rule:
 
 @dataclass(frozen=True)
 class Trial:
-    """A video that raters are asked about.
+    """A video that raters are asked about."""
 
-    Attributes:
-        id: its name in answers, which does not reveal its conditions.
-        kind: ``pair``, or a control: ``still``, ``same`` or ``repeat`` (see :class:`facediff.study.design.Showing`).
-        clip: the clip's name.
-        left: condition on the left.
-        right: condition on the right.
-        video: name of the video.
-        reference: name of the reference's video; None without one.
-    """
-
+    # Its name in answers, which does not reveal its conditions
     id: Annotated[str, Text(r"[0-9a-f]{16}", "16 hexadecimal digits")]
-    kind: Kind
+    kind: Kind  # ``pair``, or a control: ``still``, ``same`` or ``repeat`` (see :class:`facediff.study.design.Showing`)
     clip: Line
-    left: Line
-    right: Line
-    video: Video
-    reference: Video | None = None
+    left: Line  # condition on the left
+    right: Line  # condition on the right
+    video: Video  # name of the video
+    reference: Video | None = None  # name of the reference's video; None without one
 
     def preferred(self, answer: str) -> str | None:
         """The condition that an answer names; None for no difference."""
@@ -106,34 +97,21 @@ class Trial:
 
 @dataclass(frozen=True)
 class Study:
-    """A study, as its file states it.
-
-    Attributes:
-        title: shown above everything, by language.
-        consent: text by language.
-        languages: the page's languages; the first is the default.
-        methods: the methods; the first is the one that the others are compared with.
-        questions: the questions, in order.
-        rule: of exclusion.
-        trials: all videos that are asked about.
-        schedules: for rater after rater, the numbers of the trials in order.
-        seed: of the design.
-        remark: stands below every video, such as that the corpus is synthetic.
-        details: options and files.
-        version: of facediff.
-    """
+    """A study, as its file states it."""
 
     title: Texts
-    consent: Texts
-    languages: Annotated[tuple[Language, ...], Items(1)]
+    consent: Texts  # text by language
+    languages: Annotated[tuple[Language, ...], Items(1)]  # the page's languages; the first is the default
+    # The methods; the first is the one that the others are compared with
     methods: Annotated[tuple[Line, ...], Items(1)]
-    questions: tuple[Question, ...]
+    questions: tuple[Question, ...]  # the questions, in order
     rule: Rule
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  # all videos that are asked about
+    # For rater after rater, the numbers of the trials in order
     schedules: tuple[tuple[Annotated[int, Range(0)], ...], ...]
-    seed: ranges.Seed = 0
-    remark: Line = ""
-    details: Mapping[str, Any] = field(default_factory=dict)
+    seed: ranges.Seed = 0  # of the design
+    remark: Line = ""  # stands below every video, such as that the corpus is synthetic
+    details: Mapping[str, Any] = field(default_factory=dict)  # options and files
     version: Line = ""
 
     @cached_property

@@ -29,20 +29,14 @@ MOST_TRIALS = 200
 
 @dataclass(frozen=True, order=True)
 class Showing:
-    """A video of a trial: a clip with a condition on each side.
+    """A video of a trial: a clip with a condition on each side."""
 
-    Attributes:
-        kind: ``pair`` is the comparison of the study; the others are controls: the truth against a still face, the same
-            animation on both sides, and a pair that the rater sees a second time with its sides exchanged.
-        clip: the clip's name.
-        left: condition on the left, a method, ``truth`` or ``still``.
-        right: condition on the right.
-    """
-
+    # ``pair`` is the comparison of the study; the others are controls: the truth against a still face, the same
+    # animation on both sides, and a pair that the rater sees a second time with its sides exchanged
     kind: Kind
     clip: str
-    left: str
-    right: str
+    left: str  # condition on the left, a method, ``truth`` or ``still``
+    right: str  # condition on the right
 
     @property
     def mirrored(self) -> Showing:

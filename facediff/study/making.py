@@ -78,18 +78,12 @@ def draw(task: VideoTask) -> int:
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """A study after its files have been read and checked, before anything is written.
-
-    Attributes:
-        study: its definition.
-        clips: the clips by name.
-        notes: clips and questions that were left out, with the reasons.
-    """
+    """A study after its files have been read and checked, before anything is written."""
 
     options: StudyOptions
     study: Study
     clips: Mapping[str, StudyClip]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # clips and questions that were left out, with the reasons
     videos: Mapping[str, VideoTask] = field(repr=False)
 
     @cached_property

@@ -30,17 +30,11 @@ UNEQUAL = 0.1
 
 @dataclass(frozen=True)
 class MotionFile:
-    """The file of an animation; picklable, and read where it is drawn.
+    """The file of an animation; picklable, and read where it is drawn."""
 
-    Attributes:
-        path: .npz of ``facediff animate``, or .npy of vertices.
-        facts: mesh, frame rate and unit of a bare array.
-        stride: every n-th frame is used.
-    """
-
-    path: Path
-    facts: AnimationFacts = field(default_factory=AnimationFacts)
-    stride: int = 1
+    path: Path  # .npz of ``facediff animate``, or .npy of vertices
+    facts: AnimationFacts = field(default_factory=AnimationFacts)  # mesh, frame rate and unit of a bare array
+    stride: int = 1  # every n-th frame is used
 
     def read(self) -> Animation:
         """The animation; all of its frames are finite, and it can be drawn."""
@@ -62,29 +56,18 @@ class MotionFile:
 
 @dataclass(frozen=True)
 class StudyClip:
-    """A clip that all methods have.
-
-    Attributes:
-        name: its name, by which the methods' files are matched.
-        subject: who speaks.
-        motions: by condition: a method, or ``truth``.
-        sound: the recording, or an animation (.npz) that holds it.
-        frames: of every condition, by cutting the longer ones.
-        frame_rate: frames a second.
-        templates: neutral faces in one unit, for a camera that sees them all.
-        colours: vertex colours (V, 3) that all are drawn with; None for the material of the renderer.
-        reference: another clip of the speaker's truth; None if there is none.
-    """
+    """A clip that all methods have."""
 
     name: str
-    subject: str
-    motions: Mapping[str, MotionFile]
-    sound: Path
-    frames: int
+    subject: str  # who speaks
+    motions: Mapping[str, MotionFile]  # by condition: a method, or ``truth``
+    sound: Path  # the recording, or an animation (.npz) that holds it
+    frames: int  # of every condition, by cutting the longer ones
     frame_rate: float
-    templates: tuple[npt.NDArray[np.float32], ...]
+    templates: tuple[npt.NDArray[np.float32], ...]  # neutral faces in one unit, for a camera that sees them all
+    # Vertex colours (V, 3) that all are drawn with; None for the material of the renderer
     colours: npt.NDArray[np.uint8] | None
-    reference: str | None = None
+    reference: str | None = None  # another clip of the speaker's truth; None if there is none
 
     @property
     def seconds(self) -> float:
