@@ -45,7 +45,7 @@ EXTRAS = {
     "data pack p packed": "packed",
     "data unpack p unpacked": "packed",
     "data regions p": "train",
-    "data import-person p --audio a.wav --name x --corpus p --output o --frame-rate 25": "prepare",
+    "data import-person a.wav --audio a.wav --name x --corpus p --output o --frame-rate 25": "prepare",
     "components": "train",
     "check-install": "",
 }

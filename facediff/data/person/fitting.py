@@ -14,13 +14,14 @@ from facediff.data.reconstructions import read_parameters
 from facediff.data.track.face import pair_distances
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, face_size, median_face, remove_rigid_motion, robust_align
-from facediff.mesh.alignment import Indices, chunks
+from facediff.mesh.alignment import chunks
 from facediff.mesh.flame import Flame
 from facediff.metrics import LipPairs
 from facediff.speech.audio import SAMPLE_RATE
 from facediff.utils.arrays import open_array, vertices_of
 from facediff.utils.files import reserve_room
 from facediff.utils.hdf5 import HDF5_SUFFIXES
+from facediff.utils.numerics import Indices
 
 Array = npt.NDArray[np.float64]
 Speech = npt.NDArray[np.float32]

@@ -128,8 +128,8 @@ def import_person(
         entry = scratch / output.name
         for clip in clips:
             first = samples_for(clip.start, target.frame_rate)
-            part = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)
-            write_clip(entry, clip.name, frames[clip.start : clip.stop], part)
+            spoken = fit_length(speech[first:], samples_for(clip.stop, target.frame_rate) - first)
+            write_clip(entry, clip.name, frames[clip.start : clip.stop], spoken)
         write_templates(entry / "templates.pkl", {name: to_corpus.apply(neutral.face).astype(np.float32)})
         fields = {"frame_rate": target.frame_rate, "n_vertices": len(target.mean), "unit": target.unit}
         write_entry_manifest(entry, name, clips, fields, asdict(report))
