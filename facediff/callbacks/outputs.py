@@ -15,8 +15,9 @@ from lightning.pytorch.loggers import WandbLogger
 
 from facediff.callbacks.dashboard import provenance_of
 from facediff.data import SpeechMotionDataModule
+from facediff.errors import counted, note, number
 from facediff.models import AnimationModel
-from facediff.models.evaluation import METHODS
+from facediff.models.evaluation import METHODS, count_generations
 from facediff.models.inference import Prediction
 from facediff.utils.files import atomic
 from facediff.utils.hints import checks_arguments
@@ -59,6 +60,10 @@ class EpochLines(Callback):
         print(f"epoch {trainer.current_epoch + 1}{last}: {values}, {seconds:.0f} s", file=sys.stderr, flush=True)
 
 
+MANY_STEPS = 1_000_000
+"""Steps of all animations of a test above which it takes days; a thousand take some seconds on a GPU."""
+
+
 class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
@@ -69,6 +74,21 @@ class ScoreTable(Callback):
     checkpoint's SHA-256, which are also in every row of the scores. Weights & Biases gets the table of sequences as
     ``test/sequences``, and the protocol's definition in the run's config.
     """
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say how much is generated where that takes days: a paper's own test may."""
+        data: Any = trainer.datamodule  # type: ignore[attr-defined]
+        if not isinstance(pl_module, AnimationModel) or data is None or not trainer.is_global_zero:
+            return
+        samples = pl_module.test_samples if pl_module.samples else 1
+        count = count_generations(data, pl_module.unseen_identity, samples)
+        steps = int(getattr(getattr(pl_module, "sampler", None), "steps", 1))
+        if count * steps > MANY_STEPS:
+            note(
+                f"the test generates about {number(count)} animations of {counted(steps, 'sampling step')}; fewer: "
+                f"--data.test_share, --model.unseen_identity=style_only, --model.test_samples, or "
+                f"--model.sampler.steps; faster: --data.batch_size"
+            )
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print and write; runs before the model logs and empties its metrics."""
