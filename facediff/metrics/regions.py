@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, SupportsIndex
@@ -93,7 +92,6 @@ class Region(Vertices):
 
     Make one with :meth:`Region.from_indices`, :meth:`Region.from_file` or :meth:`Region.from_weights`, which sort and
     remove duplicates; the plain constructor takes indices that are sorted and distinct already and refuses others.
-    ``first | second`` is the union of two regions.
 
     Args:
         name: printed next to a score, for example ``"biwi/lve"``.
@@ -200,23 +198,6 @@ class Region(Vertices):
                 f"region {name!r} needs finite weights, one for each vertex, some of them above {threshold:g}"
             )
         return cls.from_indices(name, indices, n_vertices=len(values))
-
-    def union(self, *regions: Region, name: str | None = None) -> Region:
-        """The vertices of this region and others; vertices that they share count as duplicates.
-
-        >>> print(Region("forehead", (1, 2)).union(Region("eyes", (2, 3))))
-        forehead + eyes (3 vertices, 8a6ae151)
-        """
-        parts = (self, *regions)
-        sizes = [part.n_vertices for part in parts if part.n_vertices is not None]
-        for part, size in product(parts, sizes):
-            part.check(size)
-        indices = (index for part in parts for index in part.indices)
-        title = name or " + ".join(part.name for part in parts)
-        return Region.from_indices(title, indices, n_vertices=sizes[0] if sizes else None)
-
-    def __or__(self, region: Region) -> Region:
-        return self.union(region)
 
 
 RegionLike = Region | Sequence[int] | Tensor

@@ -198,8 +198,9 @@ class ClipSpeechLipCorrelation(SumsMetric):
     def covered(self) -> Coverage:
         """Sequences of this process that were scored, cut and left out."""
         sequences, frames = (int(self.sums[_enters(self.sums), column].sum()) for column in (_CLIPS, _FRAMES))
-        left_out = int(self.counts[4] + self.sums[:, _CLIPS].sum()) - sequences
-        return Coverage(frames, sequences, *self.counts[2:4].tolist(), left_out)
+        cut_prediction, cut_truth, left_out = self.counts[2:].tolist()
+        left_out += int(self.sums[:, _CLIPS].sum()) - sequences
+        return Coverage(frames, sequences, cut_prediction, cut_truth, left_out)
 
 
 clip_speech_lip_correlation = functional(ClipSpeechLipCorrelation)

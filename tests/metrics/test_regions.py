@@ -80,16 +80,6 @@ def test_bad_weights_are_named(tmp_path: Path, content: str) -> None:
             Region.from_weights(weights, 0.5)
 
 
-def test_unions_hold_each_vertex_once_and_report_the_shared() -> None:
-    forehead, eyes = Region("forehead", (1, 2, 5)), Region.from_indices("eyes", [5, 2, 7], n_vertices=9)
-    both = forehead | eyes
-    assert (both.name, both.indices, both.duplicates, both.n_vertices) == ("forehead + eyes", (1, 2, 5, 7), 2, 9)
-    assert both == forehead.union(eyes, name="forehead + eyes")
-    assert forehead.union(eyes, Region("nose", (0,)), name="upper").indices == (0, 1, 2, 5, 7)
-    with pytest.raises(ValueError, match="belongs to a mesh of 9 vertices, not of"):
-        eyes | Region("x", (1,), 8)
-
-
 # Of the meshes themselves, and of the index files and masks that circulate with them.
 PUBLISHED = {
     "biwi": (23370, {4996}, {7784}),

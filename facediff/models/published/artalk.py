@@ -341,12 +341,6 @@ class ChunkStream(SpeechStream):
     """Animates speech that arrives in pieces, chunk by chunk: the very frames that the whole recording gives.
 
     A frame is certain four seconds and four frames later at most: a chunk, and half of the longest filter.
-
-    Args:
-        model: the animating model.
-        clip: as :class:`~facediff.models.inference.SpeechStream` takes it.
-        seeds: as there; nothing is random.
-        plan: as there; the chunks are the model's own.
     """
 
     model: ARTalk
@@ -431,12 +425,7 @@ def smoothed(motion: npt.NDArray[np.float32], head: Sequence[int]) -> npt.NDArra
 
 
 class PastAttention(nn.Module):
-    """Attention of a chunk's tokens to the chunk before's and to each other, by the angle between them.
-
-    Args:
-        dim: channels.
-        num_heads: attention heads.
-    """
+    """Attention of a chunk's tokens to the chunk before's and to each other, by the angle between them."""
 
     def __init__(self, dim: int, num_heads: int) -> None:
         super().__init__()
@@ -461,14 +450,7 @@ class PastAttention(nn.Module):
 
 
 class ModulatedBlock(nn.Module):
-    """Attention and a map of each token, which the token's speech scales and shifts.
-
-    Args:
-        dim: channels.
-        audio_width: channels of the speech.
-        num_heads: attention heads.
-        hidden: channels between the two maps.
-    """
+    """Attention and a map of each token, which the token's speech scales and shifts."""
 
     def __init__(self, dim: int, audio_width: int, num_heads: int, hidden: int) -> None:
         super().__init__()

@@ -68,9 +68,6 @@ class BitCodec(nn.Module):
     """Motion to bits and back, each chunk together with the one before it.
 
     Its sizes are options of ``ARTalk``.
-
-    Attributes:
-        motion_mean, motion_std: by which motion is standardised.
     """
 
     mask: Tensor

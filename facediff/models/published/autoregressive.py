@@ -16,9 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import StepRule
-from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import AttentionContext, Heads, Layers, Share, Width, check_heads
 from facediff.models.published.base import LongSpeech, PublishedModel, still_map
@@ -72,13 +70,6 @@ class AutoregressiveModel(PublishedModel):
             "steps": 2 if self.pairs else 1,
         }
         self.plan_long_speech(long_speech)
-
-    def graphs(self) -> Graphs:
-        """None: each frame needs those before it."""
-        raise FaceDiffError(
-            f"{type(self).__name__}: decodes frame by frame, which needs a graph with a memory, and cannot be "
-            f"exported; export a model that generates all frames in one pass, or animate with facediff animate"
-        )
 
     def encode_speech(self, batch: Batch, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch steps width"]:
         """Speech features: as many as frames, or two for each where speech comes in pairs."""
@@ -140,13 +131,7 @@ class OffsetModel(AutoregressiveModel):
 
 
 class ProjectedAttention(nn.Module):
-    """Multi-head attention with one stacked map for queries, keys and values, as in PyTorch's own layer.
-
-    Args:
-        dim: channels.
-        num_heads: heads.
-        dropout: on the attention's weights in training.
-    """
+    """Multi-head attention with one stacked map for queries, keys and values, as in PyTorch's own layer."""
 
     def __init__(self, dim: int, num_heads: int, dropout: float) -> None:
         super().__init__()
@@ -192,14 +177,7 @@ class ProjectedAttention(nn.Module):
 
 
 class SpeechDecoderLayer(nn.Module):
-    """The parts of a layer of a decoder: self-attention, attention to the speech, feed-forward.
-
-    Args:
-        dim: channels.
-        num_heads: attention heads.
-        hidden_dim: channels of the feed-forward layer.
-        dropout: everywhere.
-    """
+    """The parts of a layer of a decoder: self-attention, attention to the speech, feed-forward."""
 
     def __init__(self, dim: int, num_heads: int, hidden_dim: int, dropout: float) -> None:
         super().__init__()
@@ -226,17 +204,7 @@ class DecoderLayer(SpeechDecoderLayer):
 
 
 class PeriodicDecoder(nn.Module):
-    """The decoder: tokens of frames, and the speech that they go with, to one vector for each frame.
-
-    Args:
-        dim: channels; even.
-        num_layers: layers.
-        num_heads: attention heads.
-        hidden_dim: channels of the feed-forward layers.
-        dropout: everywhere, and on the positions.
-        period: frames after which positions and bias repeat.
-        steps: steps of speech that belong to a frame.
-    """
+    """The decoder: tokens of frames, and the speech that they go with, to one vector for each frame."""
 
     def __init__(
         self, *, dim: int, num_layers: int, num_heads: int, hidden_dim: int, dropout: float, period: int, steps: int
@@ -261,12 +229,7 @@ class PeriodicDecoder(nn.Module):
 
 
 class Continuation:
-    """A decoder that goes on frame by frame, with the keys and values of all earlier frames.
-
-    Args:
-        decoder: the decoder.
-        memory: all speech, (batch, steps, dim).
-    """
+    """A decoder that goes on frame by frame, with the keys and values of all earlier frames."""
 
     def __init__(self, decoder: PeriodicDecoder, memory: Float[Tensor, "batch steps dim"]) -> None:
         self.decoder, self.frame, self.frames = decoder, 0, memory.shape[1] // decoder.steps
@@ -293,16 +256,7 @@ class Continuation:
 
 
 class SpeechDecoder(nn.Module):
-    """Maps of speech and of earlier motion into a decoder; what stands behind it is added by a method.
-
-    Attributes:
-        style: weights of the training identities to a vector of the decoder's width; added by a method as well.
-
-    Args:
-        audio_width: channels of the features of speech.
-        coordinates: numbers of a frame, 3V.
-        decoder: the decoder's options.
-    """
+    """Maps of speech and of earlier motion into a decoder; what stands behind it is added by a method."""
 
     style: nn.Module
 
@@ -324,14 +278,7 @@ class SpeechDecoder(nn.Module):
 
 
 class AutoregressiveNetwork(SpeechDecoder):
-    """Features of speech and a speaker's style to offsets of the vertices, frame by frame.
-
-    Args:
-        audio_width: channels of the features.
-        coordinates: numbers of a frame, 3V.
-        style: weights of the training identities to a vector of the decoder's width.
-        decoder: the decoder's options.
-    """
+    """Features of speech and a speaker's style to offsets of the vertices, frame by frame."""
 
     def __init__(
         self,

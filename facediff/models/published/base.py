@@ -217,10 +217,9 @@ class PublishedModel(AnimationModel):
 
         A clip that has a style of :meth:`own_styles`, or a mixture of them, has its weights.
         """
-        count = len(self.identities)
-        if batch.style is not None and batch.style.shape[1] == count:
-            return batch.style.to(batch.template)
-        return self.weights_of(batch.identity).to(batch.template)
+        weights = self.weights_of(batch.identity)
+        styled = batch.style is not None and batch.style.shape[1] == weights.shape[1]
+        return (batch.style if styled else weights).to(batch.template)  # type: ignore[union-attr]
 
     def weights_of(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identities"]:
         """One-hot rows of identities; of an unknown speaker (−1) :meth:`unknown_weights`."""

@@ -24,7 +24,6 @@ from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import VERTICES, Space
 from facediff.utils.hints import is_name
 from facediff.utils.licences import Commercial, Licence
-from facediff.utils.limits import quoted
 
 Renames = tuple[tuple[str, str], ...]
 """Regular expressions with their replacements, each applied in turn."""
@@ -249,11 +248,6 @@ class AuthorFiles:
                     f"{self.source}: {name} does not follow from {sizes['hidden_size']} channels and "
                     f"{len(convolutions)} convolutions; give {{audio_config}} config.json with it"
                 )
-        strides = config.get("conv_stride")
-        if strides is not None and not all(type(stride) is int and stride > 0 for stride in strides):
-            raise OptionError.naming(
-                f"{{audio_config}}: its conv_stride is {quoted(strides)}; expected numbers above 0"
-            )
         config.setdefault("num_attention_heads", sizes["hidden_size"] // 64)
         # The network has a place for the vector that SpecAugment writes on masked steps only where it is to mask.
         masked = f"{prefix}masked_spec_embed" in self.tensors

@@ -23,17 +23,7 @@ TABLE_ROWS = 600
 
 
 class ClipStyleEncoder(nn.Module):
-    """A clip of motion to a style vector.
-
-    Args:
-        channels: numbers of a frame.
-        dim: channels of the Transformer, and of the style.
-        num_layers: its layers.
-        num_heads: its attention heads.
-        feed_forward_dim: channels between the two maps of its feed-forward layers.
-        rows: rows of the table of positions; a clip has fewer frames.
-        dropout: in the Transformer, in training.
-    """
+    """A clip of motion to a style vector."""
 
     table: Tensor
 

@@ -388,11 +388,7 @@ class CodeTalker(AutoregressiveModel):
 
 
 class NoSpeech(AudioEncoder):
-    """Stands in for the audio encoder of a model that takes no speech.
-
-    Args:
-        dim: has no meaning.
-    """
+    """Stands in for the audio encoder of a model that takes no speech."""
 
     def __init__(self, *, dim: Width) -> None:
         super().__init__()
@@ -403,15 +399,7 @@ class NoSpeech(AudioEncoder):
 
 
 class Predictor(SpeechDecoder):
-    """Features of speech, a speaker's row and earlier motion to features of codes.
-
-    Args:
-        audio_width: channels of the features of speech.
-        coordinates: numbers of a frame, 3V.
-        width: channels of all codes of a frame.
-        n_identities: rows of the table of speakers.
-        decoder: options of the decoder.
-    """
+    """Features of speech, a speaker's row and earlier motion to features of codes."""
 
     def __init__(
         self, *, audio_width: int, coordinates: int, width: int, n_identities: int, decoder: dict[str, Any]

@@ -8,13 +8,7 @@ from torch import Tensor, nn
 
 
 class NormedConvolution(nn.Module):
-    """A convolution over three frames, layer norm over channels, the input added if ``residual``, ReLU.
-
-    Args:
-        inputs: channels of the input.
-        outputs: channels of the result.
-        residual: add the input to the normed result, through a convolution of its own where the channels differ.
-    """
+    """A convolution over three frames, layer norm over channels, the input added if ``residual``, ReLU."""
 
     def __init__(self, inputs: int, outputs: int, *, residual: bool) -> None:
         super().__init__()
@@ -35,14 +29,7 @@ class NormedConvolution(nn.Module):
 
 
 class ConvolutionStack(nn.Module):
-    """Several :class:`NormedConvolution` one after the other.
-
-    Args:
-        inputs: channels of the input.
-        outputs: channels of the result, and between the layers.
-        layers: how many there are.
-        residual: whether each adds its input.
-    """
+    """Several :class:`NormedConvolution` one after the other."""
 
     def __init__(self, inputs: int, outputs: int, *, layers: int = 3, residual: bool = True) -> None:
         super().__init__()

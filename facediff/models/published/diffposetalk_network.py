@@ -96,11 +96,7 @@ class PoseDenoiser(nn.Module):
 
 
 class CosineProcess(NoiseProcess):
-    """The cosine schedule (Nichol & Dhariwal 2021, eq. 17), clipped, in single precision as published.
-
-    Args:
-        steps: noising steps.
-    """
+    """The cosine schedule (Nichol & Dhariwal 2021, eq. 17), clipped, in single precision as published."""
 
     def __init__(self, steps: int) -> None:
         times = torch.linspace(0, steps, steps + 1, device="cpu")

@@ -111,10 +111,6 @@ class PosteriorSampler(Sampler):
 
     ``ddpm`` over all steps differs by rounding alone: where hardly any noise is left, a variance that is computed back
     from ᾱ has lost its digits.
-
-    Args:
-        process: the noise process to reverse.
-        skipped: noisiest steps that are left out.
     """
 
     linear: ClassVar[bool] = True
@@ -140,11 +136,6 @@ class SeededNoise:
     """Unit Gaussian noise as a generator with a clip's seed gives it, zero on the clip's padding.
 
     The clip's name does not enter, unlike in the other models: so a seed gives the published code's noise.
-
-    Args:
-        frames: of each clip.
-        seeds: one for each clip.
-        device: where the noise is drawn.
     """
 
     def __init__(self, frames: Sequence[int], seeds: Sequence[int], device: torch.device) -> None:
@@ -160,14 +151,7 @@ class SeededNoise:
 
 
 class LinearEnds(Protocol):
-    """A network between two linear maps.
-
-    Attributes:
-        audio_map: from features of speech to the network's width.
-        motion_in: E x + e, from noisy motion x (3V) to the network's width.
-        motion_out: U h + b, from features h to clean motion.
-        of_weights: the products of both.
-    """
+    """A network between two linear maps."""
 
     audio_map: nn.Linear
     motion_in: nn.Linear

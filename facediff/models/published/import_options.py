@@ -97,9 +97,7 @@ class ImportOptions:
         ignored = options.pop("ignore", [])
         options["ignore"] = [ignored] if isinstance(ignored, str) else list(ignored)
         for text in self.option or []:
-            name, equals, value = text.partition("=")
-            if not equals or not name:
-                raise OptionError.naming(f"{{option}} {text}: expected a name and a value, such as num_heads=4")
+            name, _, value = text.partition("=")
             if name == "ignore":
                 options["ignore"].append(value)
             else:

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -41,14 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Conversion:
-    """A model of an author's checkpoint, and the checkpoint's weights.
-
-    Attributes:
-        files: the tensors as they were read, with those that are not needed.
-        facts: faces and data.
-        model: as the files ask for it.
-        weights: by the model's names.
-    """
+    """A model of an author's checkpoint, and the checkpoint's weights."""
 
     files: AuthorFiles
     facts: Facts
@@ -173,31 +167,14 @@ def read_files(paths: Sequence[Path]) -> AuthorFiles:
 # Faces and data, which no file holds.
 
 
-@dataclass(frozen=True)
-class Dataset:
-    """A data set as the projects take it for granted.
-
-    Attributes:
-        n_vertices: vertices of its faces.
-        frame_rate: frames a second that the methods animate.
-        identities: training identities in the order of every project's tables.
-        unit: unit of length.
-    """
-
-    n_vertices: int
-    frame_rate: float
-    identities: tuple[str, ...]
-    unit: str
-
-
-def datasets() -> dict[str, Dataset]:
-    """The data sets of the released checkpoints."""
+def datasets() -> dict[str, Any]:
+    """The data sets of the released checkpoints: vertices, frame rate, unit, identities in the order of the tables."""
     from facediff.data.biwi import Biwi
     from facediff.data.vocaset import Vocaset
 
-    known = {m.corpus_name: Dataset(m.n_vertices, m.frame_rate, tuple(m.identities), m.unit) for m in (Vocaset, Biwi)}
-    identities = ("2", "3", "6", "7", "9", "10", "11", "12", "13")
-    return {**known, "multiface": Dataset(6172, 30.0, identities, "0.122")}
+    identities = ["2", "3", "6", "7", "9", "10", "11", "12", "13"]
+    multiface = SimpleNamespace(n_vertices=6172, frame_rate=30.0, identities=identities, unit="0.122")
+    return {"vocaset": Vocaset, "biwi": Biwi, "multiface": multiface}
 
 
 def facts_of(files: AuthorFiles, options: ImportOptions, given_options: Mapping[str, Any]) -> Facts:
@@ -253,9 +230,17 @@ def assets_of(facts: Facts, options: ImportOptions) -> Assets:
                 "no --regions: until it is tested on a corpus, its lips and upper face stand for all vertices, so "
                 "scores by region mean nothing"
             )
-        triangles = read_triangles(options.mesh, points)
-        if triangles is None:
+        if options.mesh is None:
             facts.notes.append("no --mesh: its faces have no triangles, so they can be written but not drawn")
+        else:
+            from facediff.mesh import read_mesh
+
+            face = read_mesh(Path(options.mesh))
+            if len(face.vertices) != points:
+                raise OptionError.naming(
+                    f"{{mesh}} {options.mesh}: has {len(face.vertices)} vertices, the checkpoint {points}"
+                )
+            triangles = torch.as_tensor(face.faces).long()
     else:
         for name in tuple(indices):
             if channels := facts.space.region(name):
@@ -281,18 +266,6 @@ def assets_of(facts: Facts, options: ImportOptions) -> Assets:
     if options.mesh is not None and not facts.space.is_vertices:
         facts.notes.append("--mesh has no effect: channels without a mesh are animated")
     return assets
-
-
-def read_triangles(mesh: Path | None, points: int) -> Tensor | None:
-    """The triangles of a mesh, if there is one."""
-    from facediff.mesh import read_mesh
-
-    if mesh is None:
-        return None
-    face = read_mesh(Path(mesh))
-    if len(face.vertices) != points:
-        raise OptionError.naming(f"{{mesh}} {mesh}: has {len(face.vertices)} vertices, the checkpoint {points}")
-    return torch.as_tensor(face.faces).long()
 
 
 # Options.

@@ -98,13 +98,7 @@ class PriorCoder(nn.Module):
 
 
 class Codes(NamedTuple):
-    """Tokens and the codes nearest to them.
-
-    Attributes:
-        values: the codes, through which gradients pass as if they were the tokens.
-        entries: the codes themselves, without the tokens' gradients.
-        numbers: which codes they are.
-    """
+    """Tokens and the codes nearest to them."""
 
     values: Float[Tensor, "batch frames width"]
     entries: Float[Tensor, "batch frames width"]

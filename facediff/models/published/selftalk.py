@@ -360,12 +360,7 @@ class Transcription(NamedTuple):
 
 
 class TextNetwork(nn.Module):
-    """A frozen speech recogniser with a CTC head, without dropout also in training.
-
-    Args:
-        source: a name on the Hugging Face hub or a directory.
-        config: its configuration; if given, the weights are left for a checkpoint to fill in.
-    """
+    """A frozen speech recogniser with a CTC head, without dropout also in training."""
 
     def __init__(self, source: str, config: dict[str, Any] | None) -> None:
         super().__init__()

@@ -93,10 +93,6 @@ class SpeakerStyle(nn.Module):
     Each of the numbers of e becomes three vectors of four numbers, by which the attention has its query, key and value.
     The published attention sees each number as a sequence of length one, so that the softmax over its only key is 1
     and query and key have no influence: the maps of its values are left.
-
-    Args:
-        count: speakers.
-        dim: channels of a style.
     """
 
     LIFTED = 4

@@ -159,12 +159,6 @@ class UniTalker(DirectModel):
         count = len(self.identities)
         return F.one_hot(torch.where(identity >= 0, identity, count), count + 1).float()
 
-    def identity_weights(self, batch: Batch) -> Float[Tensor, "batch rows"]:
-        """One-hot rows of the clips' identities, or the weights of their styles."""
-        if batch.style is not None and batch.style.shape[1] == len(self.identities) + 1:
-            return batch.style.to(batch.template)
-        return self.weights_of(batch.identity).to(batch.template)
-
     def own_styles(self) -> dict[str, Style]:
         """Each training identity, and the common style."""
         names = [*self.identities, COMMON]
