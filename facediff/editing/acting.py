@@ -32,13 +32,9 @@ Degrees = Annotated[float, Range(0, 10)]
 
 
 class Acting(ABC):
-    """Moves brows, head and lids with the speech.
+    """Moves brows, head and lids with the speech."""
 
-    Attributes:
-        look_ahead: largest delay of a frame, in seconds of speech after it.
-    """
-
-    look_ahead: float = 0.0
+    look_ahead: float = 0.0  # Largest delay of a frame, in seconds of speech after it
 
     def __init_subclass__(cls, **options: Any) -> None:  # noqa: ANN401
         """Let every constructor refuse options that are out of range."""
@@ -181,12 +177,9 @@ class _ProsodyPerformer(Performer):
         self._prosody = ProsodyTracker()
         self._frames = 0  # given out
         self._seen = 0  # events that have been turned into gestures
-        # Gestures by channel: (seconds of the peak's beginning, size).
-        self._raises: list[tuple[float, float]] = []
-        self._nods: list[tuple[float, float]] = []
-        self._turns: list[tuple[float, float, float]] = []
-        self._blinks: list[tuple[float, float]] = []
-        self._planned: tuple[list[Any], ...] = (self._raises, self._nods, self._turns, self._blinks)
+        # Gestures by channel: seconds of the peak's beginning, and sizes.
+        self._planned: tuple[list[Any], ...] = ([], [], [], [])
+        self._raises, self._nods, self._turns, self._blinks = self._planned
         random = np.random.default_rng([seed, STREAM])
         self._phases = random.uniform(0, 2 * math.pi, (3, len(WAVES))).tolist()
 
@@ -244,36 +237,27 @@ class _ProsodyPerformer(Performer):
         """The values at a time."""
         options = self.options
         drift = options.drift * self._liveliness(seconds)
-        wander = [
-            share
-            * sum(math.sin(2 * math.pi * rate * seconds + phase) for rate, phase in zip(WAVES, phases, strict=True))
-            for share, phases in zip(DRIFTS, self._phases, strict=True)
-        ]
-        pitch, yaw, roll = (drift * angle / len(WAVES) for angle in wander)
+
+        def wander(phases: list[float]) -> float:
+            return sum(
+                math.sin(2 * math.pi * rate * seconds + phase) for rate, phase in zip(WAVES, phases, strict=True)
+            )
+
+        pitch, yaw, roll = (
+            drift * (share * wander(phases)) / len(WAVES) for share, phases in zip(DRIFTS, self._phases, strict=True)
+        )
         pitch += options.nods * self._together(self._nods, NOD, seconds)
         for time, turn, tilt in self._turns:
             angle = TURN_SHARE * options.nods * gesture(seconds - time, TURN)
             yaw, roll = yaw + angle * turn, roll + angle * tilt
         raised = self._together(self._raises, RAISE, seconds)
         shut = max((gesture(seconds - time, BLINK) for time, _ in self._blinks), default=0.0)
-        return [
-            options.strength * options.brows * raised,
-            shut,
-            options.strength * pitch,
-            options.strength * yaw,
-            options.strength * roll,
-        ]
+        return [options.strength * options.brows * raised, shut, *(options.strength * a for a in (pitch, yaw, roll))]
 
-    def _together(
-        self, gestures: list[tuple[float, float]], shape: tuple[float, float, float], seconds: float
-    ) -> float:
+    def _together(self, gestures: list[Any], shape: tuple[float, float, float], seconds: float) -> float:
         """Gestures that overlap, limited to 1."""
-        left = 1.0
-        for time, size in gestures:
-            # As probabilities combine: two overlapping rises go further than one, and no number of them beyond the
-            # whole way.
-            left *= 1 - size * gesture(seconds - time, shape)
-        return 1 - left
+        # As probabilities combine: two overlapping rises go further than one, and no number of them beyond the end.
+        return 1 - math.prod(1 - size * gesture(seconds - time, shape) for time, size in gestures)
 
     def _liveliness(self, seconds: float) -> float:
         """How lively the head is, 0 to 1: a weighted share of speech around a time."""

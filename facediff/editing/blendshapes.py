@@ -260,10 +260,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
             f"in another unit do; look at them, or raise {{residual_limit}} from {options.residual_limit:g}"
         )
     about = {
-        "smoothness": f"{options.smoothness:g}",
-        "symmetry": f"{options.symmetry:g}",
-        "sparsity": f"{options.sparsity:g}",
-        "ridge": f"{options.ridge:g}",
+        **{name: f"{getattr(options, name):g}" for name in ("smoothness", "symmetry", "sparsity", "ridge")},
         "bounds": f"{options.lower:g} {options.upper:g}",
         "region": options.region or "whole face",
         "converged": "yes" if converged else f"no, after {MOST_STEPS} iterations",
@@ -397,11 +394,11 @@ def vertex_areas(vertices: Floats, faces: Integers) -> Array:
 
 def _displacements(animation: Animation, moving: Moving) -> Iterator[tuple[slice, Array]]:
     """Displacements (frames, N, 3) from the template, some frames at a time."""
-    step = max(1, CHUNK_BYTES // (24 * len(animation.template)))
+    template = np.asarray(animation.template, np.float64)
+    step = max(1, CHUNK_BYTES // (24 * len(template)))
     for first in range(0, len(animation.vertices), step):
-        chunk = np.asarray(animation.vertices[first : first + step], np.float64)
-        moved = (chunk - np.asarray(animation.template, np.float64))[:, moving.vertices]
-        yield slice(first, first + len(chunk)), moved
+        frames = slice(first, first + step)
+        yield frames, (np.asarray(animation.vertices[frames], np.float64) - template)[:, moving.vertices]
 
 
 def _residuals(animation: Animation, moving: Moving, values: Array) -> tuple[Array, Array]:

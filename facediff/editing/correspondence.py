@@ -6,7 +6,7 @@ source, and nearest points of a surface, which all of them need.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ from facediff.editing.face_features import OPPOSITE, Features, find_features
 from facediff.editing.landmarks import Landmarks
 from facediff.editing.lid_transfer import EyeLids, eye_lids, eyeball_triangles
 from facediff.editing.placing import place, place_face
-from facediff.editing.surface import Nearest, Surface, nearest
+from facediff.editing.surface import Nearest, Surface, components, edges_of, nearest
 from facediff.errors import FaceDiffError
 from facediff.mesh import Similarity, align, face_size, robust_align
 from facediff.mesh.mesh import check_coordinates, triangle_areas
@@ -39,6 +39,10 @@ ABOUT_EYE = 0.8, 0.45
 LIDS_AS_ALL, LIDS_FITTED, LIDS_AT_REST = 0, 1, 2
 """What lids do: move as everything else, as on two cuts of one surface; move by their own opening; or stay at rest."""
 
+NO_INDICES: Indices = np.zeros(0, np.int64)
+NO_CORNERS: Indices = np.zeros((0, 3), np.int64)
+NO_WEIGHTS: Array = np.zeros((0, 3))
+
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
@@ -54,11 +58,13 @@ class Correspondence:
     source_faces: Indices  # (Fs, 3)
     target_vertices: Array  # (Vt, 3) the target mesh
     target_faces: Indices  # (Ft, 3)
-    hidden: Indices  # numbers of the target's triangles that the face is not searched for in
-    followers: Indices  # (A,) vertices of the target that move with its skin: brows, lashes, a beard
-    follower_corners: Indices  # (A, 3) the skin's vertices that they move with
-    follower_weights: Array  # (A, 3) their barycentric weights
-    lids: int  # LIDS_AS_ALL, LIDS_FITTED or LIDS_AT_REST
+    # Numbers of the target's triangles that the face is not searched for in
+    hidden: Indices = field(default_factory=NO_INDICES.copy)
+    # (A,) vertices of the target that move with its skin, as brows, lashes and a beard do; the skin's vertices there
+    followers: Indices = field(default_factory=NO_INDICES.copy)
+    follower_corners: Indices = field(default_factory=NO_CORNERS.copy)  # (A, 3)
+    follower_weights: Array = field(default_factory=NO_WEIGHTS.copy)  # (A, 3) their barycentric weights
+    lids: int = 0  # LIDS_AS_ALL, LIDS_FITTED or LIDS_AT_REST
 
     @cached_property
     def laid(self) -> Surface:
@@ -87,7 +93,7 @@ class Correspondence:
         """Vertices of lashes and tear lines: of pieces about an eye that are neither skin nor an eyeball."""
         source, target = self.features
         if source is None or target is None:
-            return np.zeros(0, np.int64)
+            return NO_INDICES
         face = Surface(self.source_vertices, self.source_faces)
         balls = [eyeball_triangles(face, source, eye) for eye in (0, 1)]
         is_ball = np.isin(self.corners[:, 0], self.source_faces[np.concatenate(balls)])
@@ -125,9 +131,9 @@ def correspond(
 
     Args:
         source_vertices: (Vs, 3) neutral face of the animation.
-        source_faces: (Fs, 3).
+        source_faces: (Fs, 3) its triangles.
         target_vertices: (Vt, 3) neutral face that shall move.
-        target_faces: (Ft, 3).
+        target_faces: (Ft, 3) its triangles.
         landmarks: pairs of equal points, or (L, 2) pairs of a source and a target vertex; three or more also begin the
             alignment, for meshes that show other parts of the head.
         face_triangles: numbers of the target's triangles in which to search for the face; all if None. Teeth and a
@@ -147,11 +153,8 @@ def correspond(
     if source.vertices.shape == target.vertices.shape and np.array_equal(source.faces, target.faces):
         return _vertex_by_vertex(source, target)
     target = run_alike(source, target)
-    face = (
-        target
-        if face_triangles is None
-        else Surface(target.vertices, target.faces[np.asarray(face_triangles, np.int64)])
-    )
+    searched = np.arange(len(target.faces)) if face_triangles is None else np.asarray(face_triangles, np.int64)
+    face = Surface(target.vertices, target.faces[searched])
     back, features, target_features = placed(source, face, marks)
     feature_pair = bending = None if features is None or target_features is None else (features, target_features)
     laid = Surface(back.apply(target.vertices), target.faces)
@@ -173,17 +176,12 @@ def correspond(
         # Which side of an opening a vertex belongs to is known there: no neighbour on the other side is asked.
         sided = (bending[1].codes > 0) & (left < FAR)
         trust[sided] = np.maximum(trust[sided], 1.0 - left[sided] / FAR)
-    followers = (np.zeros(0, np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3)))
+    followers: tuple[Indices, Indices, Array] = NO_INDICES, NO_CORNERS, NO_WEIGHTS
     if feature_pair is not None:
         detached = detached_parts(source, laid, *feature_pair, pairs.unpaired)
-        corners[detached.jaw], weights[detached.jaw], share[detached.jaw] = (
-            detached.jaw_point.corners[0],
-            detached.jaw_point.weights[0],
-            1.0,
-        )
-        share[detached.still] = 0.0
-        trust[detached.jaw] = trust[detached.still] = 1.0
-        followers = detached.followers, detached.follower_corners, detached.follower_weights
+        jaw, still, followers = detached.jaw, detached.still, detached.followers
+        corners[jaw], weights[jaw], share[jaw] = detached.jaw_point.corners[0], detached.jaw_point.weights[0], 1.0
+        share[still], trust[jaw], trust[still] = 0.0, 1.0, 1.0
     elif face_triangles is not None:
         unsearched = np.setdiff1d(np.arange(len(target.vertices)), face.faces)
         share[unsearched], trust[unsearched] = 0.0, 1.0
@@ -198,9 +196,7 @@ def correspond(
         source_faces=source.faces,
         target_vertices=target.vertices,
         target_faces=np.ascontiguousarray(target_faces, np.int64),
-        hidden=np.zeros(0, np.int64)
-        if face_triangles is None
-        else np.setdiff1d(np.arange(len(target.faces)), face_triangles),
+        hidden=np.setdiff1d(np.arange(len(target.faces)), searched),
         followers=followers[0],
         follower_corners=followers[1],
         follower_weights=followers[2],
@@ -213,10 +209,7 @@ def placed(
 ) -> tuple[Similarity, Features | None, Features | None]:
     """The similarity that lays a target onto a source, and the features of the source and of the target there.
 
-    Args:
-        source: the animation's mesh at rest, y up and z to the viewer.
-        target: the other one.
-        marks: pairs that begin the alignment, if there are three or more.
+    Three landmarks or more begin the alignment.
     """
     start = None
     if marks is not None and len(marks) >= 3:
@@ -281,35 +274,19 @@ def _vertex_by_vertex(source: Surface, target: Surface) -> Correspondence:
         source_faces=source.faces,
         target_vertices=target.vertices,
         target_faces=target.faces,
-        hidden=np.zeros(0, np.int64),
-        followers=np.zeros(0, np.int64),
-        follower_corners=np.zeros((0, 3), np.int64),
-        follower_weights=np.zeros((0, 3)),
-        lids=LIDS_AS_ALL,
     )
-
-
-ROUNDED = 1e-4  # Files round coordinates; two places nearer than this share of the mesh's extent are one
 
 
 def refuse_other_mesh(
     name: str, vertices: Floats, faces: Integers, expected_vertices: Floats, expected_faces: Integers
 ) -> None:
     """Require the triangles of the mesh that a correspondence was made for; vertices may have moved."""
-    if len(vertices) == len(expected_vertices) and np.array_equal(faces, expected_faces):
-        return
-    reason = f"it has {len(vertices)} vertices, not {len(expected_vertices)}"
-    if len(vertices) == len(expected_vertices):
-        extent = float(np.ptp(expected_vertices, axis=0).max())
-        # Rows sorted by position, rounding aside, so that the order of the vertices does not matter.
-        meshes = (np.asarray(points, np.float64) for points in (vertices, expected_vertices))
-        first, second = (rows[np.lexsort(np.rint(rows / (ROUNDED * extent)).T)] for rows in meshes)
-        reordered = np.abs(first - second).max() <= 2 * ROUNDED * extent
-        reason = "its vertices were reordered, as exporters do" if reordered else "it is another mesh"
-    raise FaceDiffError(
-        f"{name}: has other triangles than the correspondence's mesh: {reason}; give the mesh that it was made for "
-        f"with the order of its vertices kept, or make a new correspondence"
-    )
+    if len(vertices) != len(expected_vertices) or not np.array_equal(faces, expected_faces):
+        raise FaceDiffError(
+            f"{name}: has {len(vertices)} vertices and other triangles than the correspondence's mesh of "
+            f"{len(expected_vertices)}, as where an exporter reordered them; give the mesh that it was made for with "
+            f"the order of its vertices kept, or make a new correspondence"
+        )
 
 
 OTHER_FACE = 1e-3
@@ -347,7 +324,7 @@ class PartPairs:
         by_part = [nearest(surface, points[some], normals[some], self.size) for some, surface in self.parts]
         order = np.argsort(np.concatenate([some for some, _ in self.parts]))
         # Parts list the target's vertices in their own order; sorting restores the order of the mesh.
-        names = (field.name for field in fields(Nearest))
+        names = (entry.name for entry in fields(Nearest))
         return Nearest(**{name: np.concatenate([getattr(part, name) for part in by_part])[order] for name in names})
 
 
@@ -409,15 +386,10 @@ def part_pairs(source: Surface, laid: Surface, features: tuple[Features, Feature
 
 def pieces(surface: Surface) -> Indices:
     """A label (V,) for each vertex, equal for those that triangles join or that lie in one place."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     extent = max(float(np.ptp(surface.vertices, axis=0).max()), np.finfo(float).tiny)
     _, welded = np.unique(np.rint(surface.vertices / (WELD * extent)), axis=0, return_inverse=True)
     welded = welded.reshape(-1)  # NumPy 2.0 returns it with a second axis
-    edges, count = welded[edges_of(surface.faces)], int(welded.max()) + 1
-    joined = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return np.asarray(connected_components(joined, directed=False)[1], np.int64)[welded]
+    return components(welded[edges_of(surface.faces)], int(welded.max()) + 1)[welded]
 
 
 def _measured(surface: Surface, labels: Indices) -> tuple[Array, Array, Indices]:
@@ -454,9 +426,7 @@ def _bent(
     """The target, bent onto the source."""
     edges = edges_of(laid.faces)
     base = laid if features is None else Surface(laid.vertices + _warp(laid.vertices, *features), laid.faces)
-    rim, rim_pull = (
-        (np.zeros(0, np.int64), np.zeros((0, 3))) if features is None else _rims(base.vertices, laid, *features)
-    )
+    rim, rim_pull = (NO_INDICES, NO_WEIGHTS) if features is None else _rims(base.vertices, laid, *features)
     anchors, anchor_pull, anchor_trust = _held(source, base, marks)
     bent = base
     for stiffness in STIFFNESSES:
@@ -478,7 +448,7 @@ def _held(source: Surface, base: Surface, marks: Landmarks | None) -> tuple[Indi
     A landmark within a triangle moves all of its corners as it shall move itself, each as firmly as it weighs.
     """
     if marks is None:
-        return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
+        return NO_INDICES, NO_WEIGHTS, np.zeros(0)
     steps = marks.source.points(source.vertices) - marks.target.points(base.vertices)
     weights = marks.target.weights
     anchors, place_in = np.unique(marks.target.corners, return_inverse=True)
@@ -534,16 +504,8 @@ def _rims(base: Array, laid: Surface, features: Features, target_features: Featu
         names.append(seeds[near])
         pulls.append((laid.vertices[seeds] + (goal - curve)[sample] - base[seeds])[near])
     # Near a corner a vertex may lie along both curves: the upper one, which comes first, keeps it.
-    rim = np.concatenate([np.zeros(0, np.int64), *names])
-    rim, first = np.unique(rim, return_index=True)
-    return rim, np.concatenate([np.zeros((0, 3)), *pulls])[first]
-
-
-def edges_of(faces: Indices) -> Indices:
-    """Edges (E, 2), each once."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.sort(edges, axis=1), axis=0)
-    return edges[edges[:, 0] != edges[:, 1]]
+    rim, first = np.unique(np.concatenate([NO_INDICES, *names]), return_index=True)
+    return rim, np.concatenate([NO_WEIGHTS, *pulls])[first]
 
 
 def smooth_field(values: Array, trust: Array, edges: Indices, stiffness: float) -> Array:

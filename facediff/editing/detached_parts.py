@@ -37,9 +37,8 @@ class DetachedParts:
     jaw: Indices  # vertices of lower teeth and a tongue
     still: Indices  # vertices of all that stands still
     jaw_point: Nearest  # (1,) the point of the source that the jaw moves with
-    followers: Indices  # (A,) vertices of what lies on the mesh's own skin and moves with it
-    follower_corners: Indices  # (A, 3) the skin's vertices that they move with
-    follower_weights: Array  # (A, 3)
+    # (A,) vertices of what lies on the mesh's skin and moves with it, the skin's vertices (A, 3) there, and weights
+    followers: tuple[Indices, Indices, Array]
 
 
 def detached_parts(
@@ -55,8 +54,8 @@ def detached_parts(
     Args:
         source: the animation's face.
         laid: the mesh, in the source's place.
-        features: openings of the source's face.
-        target_features: openings of the mesh.
+        features: of the source's face.
+        target_features: of the mesh.
         unpaired: vertices of each of the mesh's pieces without a partner among the source's pieces.
     """
     from scipy.spatial import cKDTree
@@ -70,7 +69,7 @@ def detached_parts(
     none = np.zeros(0, np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3))
     unpaired = [some for some in unpaired if len(some) and not target_features.skin[some].any()]
     if not unpaired:
-        return DetachedParts(none[0], none[0], jaw_point, *none)
+        return DetachedParts(none[0], none[0], jaw_point, none)
     which, starts = np.concatenate(unpaired), np.cumsum([0, *(len(some) for some in unpaired[:-1])])
     points, counts = laid.vertices[which], np.array([len(some) for some in unpaired])
 
@@ -100,44 +99,36 @@ def detached_parts(
     lash = lash_pieces(laid.vertices, unpaired, target_features) & ~oral & ~large
     still = ~lower & ~lash & (oral | inside | between | (large & ~about))
     # What else is there lies on the skin, or is worn in front of it.
-    left = np.flatnonzero(~lower & ~lash & ~still)
-    some = np.flatnonzero(np.isin(np.repeat(np.arange(len(unpaired)), counts), left))
-    on_skin = (
-        nearest(
-            Surface(laid.vertices, laid.faces[target_features.skin[laid.faces[:, 0]]]),
-            points[some],
-            np.zeros((len(some), 3)),
-            0.0,
-        )
-        if len(some)
-        else None
-    )
-    if on_skin is not None:
+    left = ~lower & ~lash & ~still
+    lies = np.repeat(left, counts)
+    skin_faces = Surface(laid.vertices, laid.faces[target_features.skin[laid.faces[:, 0]]])
+    followers = none
+    if lies.any():
+        on_skin = nearest(skin_faces, points[lies], np.zeros((np.count_nonzero(lies), 3)), 0.0)
         away = np.zeros(len(which))
-        away[some] = on_skin.distances
-        worn = np.array([np.median(away[first : first + count]) for first, count in zip(starts, counts, strict=True)])
-        worn_piece = (worn > ON_SKIN * width) & ~about
-        worn_piece[[k for k in range(len(unpaired)) if k not in set(left)]] = False
+        away[lies] = on_skin.distances
+        distances = [np.median(away[first : first + count]) for first, count in zip(starts, counts, strict=True)]
+        worn = (np.array(distances) > ON_SKIN * width) & ~about & left
         # Frames of glasses that were large stood still already; their pads touch the nose and belong to them.
-        frames = np.repeat(worn_piece | (large & ~about & ~inside & (middle[:, 2] > mouth[2] - width)), counts)
+        frames = np.repeat(worn | (large & ~about & ~inside & (middle[:, 2] > mouth[2] - width)), counts)
         if frames.any():
             gap = cKDTree(points[frames]).query(points)[0]
             belongs = mean((gap < np.minimum(TOUCHES * width, np.maximum(away, 0.01 * width))).astype(float)) > 0.5
-            worn_piece |= belongs & np.isin(np.arange(len(unpaired)), left)
-        still |= worn_piece
-        on_skin_rows = ~np.repeat(worn_piece, counts)[some]
-        followers = which[some][on_skin_rows], on_skin.corners[on_skin_rows], on_skin.weights[on_skin_rows]
-    else:
-        followers = none
+            worn |= belongs & left
+        still |= worn
+        rows = ~np.repeat(worn, counts)[lies]
+        followers = which[lies][rows], on_skin.corners[rows], on_skin.weights[rows]
     lashes = [some for some, is_lash in zip(unpaired, lash, strict=True) if is_lash]
-    rims = _rim_places(laid.vertices, lashes, target_features)
+    rims = np.concatenate([none[0], *lashes]), *_rim_places(laid.vertices, lashes, target_features)
     return DetachedParts(
         which[np.repeat(lower, counts)],
         which[np.repeat(still, counts)],
         jaw_point,
-        np.concatenate([followers[0], *lashes]),
-        np.concatenate([followers[1], rims[0]]),
-        np.concatenate([followers[2], rims[1]]),
+        (
+            np.concatenate([followers[0], rims[0]]),
+            np.concatenate([followers[1], rims[1]]),
+            np.concatenate([followers[2], rims[2]]),
+        ),
     )
 
 
@@ -160,13 +151,7 @@ def _from_edges(points: Array, eye: Opening) -> Array:
 
 
 def lash_pieces(vertices: Array, pieces: list[Indices], features: Features) -> Mask:
-    """Which pieces of a mesh begin at the edge of a lid, and do not lie between both lids as an iris does.
-
-    Args:
-        vertices: (V, 3) of the mesh.
-        pieces: the vertices of each piece.
-        features: openings of the mesh's face.
-    """
+    """Which pieces of a mesh begin at the edge of a lid, and do not lie between both lids as an iris does."""
     points, starts = vertices[np.concatenate(pieces)], np.cumsum([0, *(len(some) for some in pieces[:-1])])
     extent = (np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)).max(axis=1)
     is_lash = np.zeros(len(pieces), bool)
@@ -182,17 +167,9 @@ def _open_eyes(vertices: Array, features: Features) -> list[LidEdges]:
 
 
 def _rim_places(vertices: Array, lashes: list[Indices], features: Features) -> tuple[Indices, Array]:
-    """The place on the edge of a lid that each vertex of lashes moves with, between two vertices of it.
+    """Two vertices of a lid's edge, the second one twice, between which each vertex of lashes moves; weights; (A, 3).
 
     All vertices of a single lash have one place, at its root, so that it keeps its shape.
-
-    Args:
-        vertices: (V, 3) of the mesh.
-        lashes: the vertices of each piece, A in all.
-        features: openings of the mesh's face.
-
-    Returns:
-        The two vertices, the second one twice, and their weights, both (A, 3).
     """
     corners, weights = [np.zeros((0, 3), np.int64)], [np.zeros((0, 3))]
     rims = [(rim, SINGLE * eye.opening.width) for eye in _open_eyes(vertices, features) for rim in eye.rims]

@@ -33,117 +33,84 @@ MOVES = 0.004  # What moves by less than this share of the eye's width is no par
 
 @dataclass(frozen=True)
 class EyeFigures:
-    """Figures of the fullest blink; None where the animation does not blink, or lids stay at rest.
+    """Figures of the fullest blink; None where the animation does not blink, or lids stay at rest."""
 
-    Attributes:
-        lid_gap: share of the opening that is still seen, of the worse eye; 0 is best.
-        hole: tallest place where shut lids are open, as a share of the opening's height, of the worse
-            eye; where few triangles are large, a lid tears though most of it is shut.
-        overshoot: how far the upper lid passes the lower one, as a share of the opening.
-        inside: share of the lids' vertices that lie inside the eyeball.
-        uneven: difference between both eyes of the share that is still seen.
-        stretch: how much the forehead's edges grow or shrink in the worst frame, but for one of 200.
-        folded: share of the forehead's moving triangles that turn over.
-    """
-
-    lid_gap: float | None
-    hole: float | None
-    overshoot: float | None
-    inside: float | None
-    uneven: float | None
-    stretch: float
-    folded: float
+    stretch: float  # how much the forehead's edges grow or shrink in the worst frame, but for one of 200
+    folded: float  # share of the forehead's moving triangles that turn over
+    lid_gap: float | None = None  # share of the opening that is still seen, of the worse eye; 0 is best
+    # Tallest place where shut lids are open, as a share of the opening's height, of the worse eye; where few triangles
+    # are large, a lid tears though most of it is shut
+    hole: float | None = None
+    overshoot: float | None = None  # how far the upper lid passes the lower one, as a share of the opening
+    inside: float | None = None  # share of the lids' vertices that lie inside the eyeball
 
 
 def check_eyes(
     animation: Animation, carried: Animation, correspondence: Correspondence, frames: Integers
 ) -> tuple[EyeFigures | None, list[str], list[str]]:
-    """Measure the upper face of a carried animation.
+    """Figures of a carried animation's upper face, None where the source shows no eyes; faults, and remarks.
 
-    Args:
-        animation: on the source mesh; with triangles.
-        carried: the same on the target mesh.
-        correspondence: the correspondence that carried it.
-        frames: numbers of the frames in which the forehead is looked at.
-
-    Returns:
-        the figures, None where the animation's face shows no eyes; faults, a clause each; and remarks.
+    The forehead is looked at in some frames. Faults and remarks are a clause each.
     """
     source, target = correspondence.features
     if source is None or target is None:
         return None, [], []
-    source_edges = [lid_edges(correspondence.source_vertices, source, eye) for eye in (0, 1)]
-    if source_edges[0] is None or source_edges[1] is None:
+    face = Surface(correspondence.source_vertices, correspondence.source_faces)
+    source_edges = [edges for eye in (0, 1) if (edges := lid_edges(face.vertices, source, eye)) is not None]
+    if len(source_edges) < 2:
         return None, [], []
-    faults, remarks = [], []
-    blink, left = fullest_blink(animation, [edges for edges in source_edges if edges is not None])
-    posed = _laid(correspondence, carried.vertices[blink])
+    faults, remarks, figures = [], [], dict[str, float]()
+    blink, left = fullest_blink(animation, source_edges)
     target_edges = [lid_edges(correspondence.laid.vertices, target, eye) for eye in (0, 1)]
-    gaps: list[float] | None = None
-    holes: list[float] = []
-    passed: list[float] | None = None
-    inside: list[float] | None = None
+    unfound = [side for side, edges in zip(("right", "left"), target_edges, strict=True) if edges is None]
     if left > BLINKS:
         pass
     elif correspondence.lids == LIDS_AT_REST:
         remarks.append("its lids stay at rest")
-    elif target_edges[0] is None or target_edges[1] is None:
-        names = (
-            ["right" if target_edges[0] is None else "left"]
-            if (target_edges[0] is None) != (target_edges[1] is None)
-            else ["right", "left"]
-        )
-        remarks.append(f"no open {' and '.join(names)} eye was found on it, so that its lids stay at rest")
+    elif unfound:
+        remarks.append(f"no open {' and '.join(unfound)} eye was found on it, so that its lids stay at rest")
     else:
-        rest = Surface(correspondence.laid.vertices, correspondence.target_faces)
-        face = Surface(correspondence.source_vertices, correspondence.source_faces)
-        original = np.asarray(animation.vertices[blink], np.float64)
-        gaps, passed, inside, expected = [], [], [], []
-        for eye in (0, 1):
-            gap, hole = _still_seen(rest, posed, target, eye)
-            gaps.append(gap)
-            holes.append(hole)
-            # Painted lids of the source may not shut either, which is no fault of the target.
-            expected.append(_still_seen(face, original, source, eye)[0])
-            passed.append(_overshoot(target_edges[eye], rest.vertices, posed))
-            inside.append(_inside_ball(rest, posed, target, eye))
-        worst = int(np.argmax(np.subtract(gaps, expected)))
-        if gaps[worst] > expected[worst] + LEFT_OPEN:
-            faults.append(
-                f"its {('right', 'left')[worst]} eye does not shut: {gaps[worst]:.0%} is left at a full blink"
-            )
-        elif max(holes) > HOLE:
-            torn = int(np.argmax(holes))
-            faults.append(
-                f"the lids of its {('right', 'left')[torn]} eye tear: a hole of {holes[torn]:.0%} of the opening's "
-                f"height is left between them at a full blink"
-            )
+        figures, faults = _check_lids(animation, carried, correspondence, face, blink)
         if not _mirror_images(target):
             faults.append("its eyes were found in places that are no mirror images, so that one is wrong")
-        if max(passed) > PASSED:
-            faults.append(f"its upper lids pass the lower ones by {max(passed):.0%} of the opening")
-        if max(inside) > INSIDE:
-            faults.append(f"its lids sink into the eyeballs: {max(inside):.0%} of their vertices")
-        if abs(gaps[0] - gaps[1]) > abs(expected[0] - expected[1]) + UNEVEN:
-            faults.append("one of its eyes shuts and the other does not")
     stretch, folded = _forehead(carried, correspondence.laid, target, source, frames, correspondence)
-    source_stretch, source_folded = _forehead(
-        animation, Surface(correspondence.source_vertices, correspondence.source_faces), source, source, frames, None
-    )
+    source_stretch, source_folded = _forehead(animation, face, source, source, frames, None)
     if stretch > source_stretch + STRETCHED:
         faults.append(f"its forehead is torn: edges grow or shrink by {stretch:.0%}")
     if folded > source_folded + FOLDED:
         faults.append(f"its forehead folds: {folded:.1%} of the moving triangles turn over")
-    figures = EyeFigures(
-        lid_gap=None if gaps is None else max(gaps),
-        hole=max(holes, default=None),
-        overshoot=None if passed is None else max(passed),
-        inside=None if inside is None else max(inside),
-        uneven=None if gaps is None else abs(gaps[0] - gaps[1]),
-        stretch=stretch,
-        folded=folded,
-    )
-    return figures, faults, remarks
+    return EyeFigures(stretch, folded, **figures), faults, remarks
+
+
+def _check_lids(
+    animation: Animation, carried: Animation, correspondence: Correspondence, face: Surface, blink: int
+) -> tuple[dict[str, float], list[str]]:
+    """Figures and faults of the lids in the frame of the fullest blink."""
+    source, target = correspondence.features
+    assert source is not None and target is not None  # noqa: S101, PT018 - for type checkers
+    rest, faults = Surface(correspondence.laid.vertices, correspondence.target_faces), []
+    posed, original = _laid(correspondence, carried.vertices[blink]), np.asarray(animation.vertices[blink], np.float64)
+    seen = [_still_seen(rest, posed, target, eye) for eye in (0, 1)]
+    gaps, holes = ([pair[k] for pair in seen] for k in (0, 1))
+    # Painted lids of the source may not shut either, which is no fault of the target.
+    expected = [_still_seen(face, original, source, eye)[0] for eye in (0, 1)]
+    passed = max(_overshoot(lid_edges(rest.vertices, target, eye), rest.vertices, posed) for eye in (0, 1))
+    inside = max(_inside_ball(rest, posed, target, eye) for eye in (0, 1))
+    worst, torn = int(np.argmax(np.subtract(gaps, expected))), int(np.argmax(holes))
+    if gaps[worst] > expected[worst] + LEFT_OPEN:
+        faults.append(f"its {('right', 'left')[worst]} eye does not shut: {gaps[worst]:.0%} is left at a full blink")
+    elif holes[torn] > HOLE:
+        faults.append(
+            f"the lids of its {('right', 'left')[torn]} eye tear: a hole of {holes[torn]:.0%} of the opening's "
+            f"height is left between them at a full blink"
+        )
+    if passed > PASSED:
+        faults.append(f"its upper lids pass the lower ones by {passed:.0%} of the opening")
+    if inside > INSIDE:
+        faults.append(f"its lids sink into the eyeballs: {inside:.0%} of their vertices")
+    if abs(gaps[0] - gaps[1]) > abs(expected[0] - expected[1]) + UNEVEN:
+        faults.append("one of its eyes shuts and the other does not")
+    return {"lid_gap": max(gaps), "hole": max(holes), "overshoot": passed, "inside": inside}, faults
 
 
 def _mirror_images(features: Features) -> bool:

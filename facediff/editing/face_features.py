@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from facediff.editing.surface import components, edges_of
 from facediff.utils.numerics import Array, Indices
 
 if TYPE_CHECKING:
@@ -104,18 +105,13 @@ class SearchWindow:
     expected: float
 
 
+@dataclass(eq=False)
 class FrontView:
-    """A mesh as it is seen from the front.
+    """A mesh as it is seen from the front, with y up and z to the viewer."""
 
-    Args:
-        vertices: (V, 3), y up and z to the viewer.
-        faces: (F, 3).
-    """
-
-    def __init__(self, vertices: Array, faces: Indices) -> None:
-        self.vertices = vertices
-        # Triangles without area stay: they join what lies in one place, and without them it would look like a border.
-        self.faces = faces
+    vertices: Array  # (V, 3)
+    # (F, 3), those without area too: they join what lies in one place, and without them it would look like a border
+    faces: Indices
 
     @cached_property
     def welded(self) -> Indices:
@@ -124,9 +120,6 @@ class FrontView:
         A seam lies on the border of the mesh, which the inside of lips that touch does not. The border runs in loops: a
         cut, such as that between the closed lips of a mask, is one loop with two halves on one another.
         """
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
         count = len(self.vertices)
         welded = np.arange(count)
         border = border_edges(self.faces)
@@ -140,8 +133,7 @@ class FrontView:
         welded[rim] = rim[first[names.reshape(-1)]]
         if (welded == np.arange(count)).all():
             return welded
-        joined = coo_array((np.ones(len(border)), (border[:, 0], border[:, 1])), shape=(count, count))
-        loops = connected_components(joined, directed=False)[1][rim]
+        loops = components(border, count)[rim]
         for name in np.flatnonzero(np.bincount(loops) >= 6):
             loop = rim[loops == name]
             positions, counts = np.unique(welded[loop], return_counts=True)
@@ -160,14 +152,7 @@ class FrontView:
     @cached_property
     def pieces(self) -> Indices:
         """(V,) a label for each vertex, equal for those that triangles join."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
-        a, b, c = self.corners.T
-        rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
-        count = len(self.vertices)
-        joined = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)), False)[1]
-        return np.asarray(joined, np.int64)[self.welded]
+        return components(self.corners[:, [[0, 1], [1, 2]]].reshape(-1, 2), len(self.vertices))[self.welded]
 
     def graph(self, triangles: Indices) -> tuple[csr_array, Indices]:
         """Lengths of edges between welded vertices of some triangles, and the row (V,) of each vertex; -1 for none."""
@@ -175,10 +160,7 @@ class FrontView:
 
         corners = self.corners[triangles]
         vertices, slots = np.unique(corners, return_inverse=True)
-        slots = slots.reshape(-1, 3)
-        edges = np.concatenate([slots[:, [0, 1]], slots[:, [1, 2]], slots[:, [2, 0]]])
-        edges = np.unique(np.sort(edges, axis=1), axis=0)
-        edges = edges[edges[:, 0] != edges[:, 1]]
+        edges = edges_of(slots.reshape(-1, 3))
         lengths = np.linalg.norm(self.vertices[vertices[edges[:, 0]]] - self.vertices[vertices[edges[:, 1]]], axis=1)
         # SciPy's sparse graphs take an explicit zero for a missing edge; welded vertices lie at distance 0.
         lengths = np.maximum(lengths, 1e-12)
@@ -262,13 +244,10 @@ class FrontView:
     def opening(
         self, window: SearchWindow, skin: npt.NDArray[np.bool_], highest: float, behind: float
     ) -> Opening | None:
-        """The opening in a window; None if the skin is whole there.
+        """The opening in a window; None if the skin (V,) is whole there.
 
-        Args:
-            window: where to look.
-            skin: (V,) the piece to look at.
-            highest: how far apart both sides may stand, as a share of the expected width.
-            behind: what lies this share of the width behind the surface in front of it is inside.
+        Its sides stand no further apart than a share of the expected width, ``highest``, and what lies the share
+        ``behind`` behind the surface in front of it is inside.
         """
         from scipy.ndimage import grey_closing
 
@@ -437,8 +416,6 @@ def _following(valid: npt.NDArray[np.bool_], tall: int) -> Indices:
 
 def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low: Array) -> Indices | None:
     """Which pairs are the opening: the chain of neighbouring ones that is widest and nearest to the middle."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     if not len(pairs):
@@ -447,11 +424,7 @@ def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low
     tree = cKDTree(np.stack([pairs[:, 2] * 1.0, 0.75 * middle], 1))
     # Pixels that lie a few columns or rows apart are one chain: teeth interrupt an opening, and it is steep at its
     # corners.
-    near = tree.query_pairs(4.5, output_type="ndarray")
-    count = len(pairs)
-    labels = connected_components(coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(count,) * 2), False)[
-        1
-    ]
+    labels = components(tree.query_pairs(4.5, output_type="ndarray"), len(pairs))
     best, best_worth = None, 0.0
     for name in np.unique(labels):
         some = np.flatnonzero(labels == name)
@@ -516,12 +489,9 @@ width. A socket is a hollow: the inside of an eye lies deeper than that."""
 
 
 def find_features(vertices: Array, faces: Indices, expected: Features | Opening | None = None) -> Features | None:
-    """The openings of a face; None if it has no mouth that can open.
+    """The openings of a face (V, 3), (F, 3), y up and z to the viewer; None if it has no mouth that can open.
 
-    Args:
-        vertices: (V, 3), y up and z to the viewer.
-        faces: (F, 3).
-        expected: features of a face that lies in the same place, or its mouth; searched for everywhere if None.
+    They are searched for where another face has its features, or its mouth, and everywhere without one.
     """
     view = FrontView(vertices, faces)
     expected_mouth = expected.mouth if isinstance(expected, Features) else expected
@@ -543,34 +513,21 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
     if mouth is None or skin is None:
         return None
     mouth = view.completed(mouth, width)
-    if isinstance(expected, Features):
-        away = np.abs(mouth.centre - expected_mouth.centre)[:2] / width
-        if (away > ASIDE).any():
-            return None
+    if isinstance(expected, Features) and (np.abs(mouth.centre - expected_mouth.centre)[:2] / width > ASIDE).any():
+        return None
     width = mouth.width
     x, y, _ = mouth.centre
     eyes: list[Opening | None] = []
     for side in (0, 1):
-        expected_eye = expected.eyes[side] if isinstance(expected, Features) else None
-        if isinstance(expected, Features) and expected_eye is None:
-            eyes.append(None)
-            continue
-        if expected_eye is None:
+        windows = []
+        if not isinstance(expected, Features):
             # Proportions of an average face in widths of its mouth; the window leaves room for others.
             sign = 2 * side - 1
             windows = [SearchWindow(x + 0.62 * sign * width, y + 1.4 * width, 0.5 * width, 0.6 * width, 0.55 * width)]
-        else:
+        elif (known := expected.eyes[side]) is not None:
             # A longer or shorter face has its eyes elsewhere: the larger window comes second, as for the mouth.
-            windows = [
-                SearchWindow(
-                    expected_eye.centre[0],
-                    expected_eye.centre[1],
-                    0.85 * grown * expected_eye.width,
-                    0.75 * grown * expected_eye.width,
-                    expected_eye.width,
-                )
-                for grown in (1.0, 1.6)
-            ]
+            middle, wide = known.centre[:2], known.width
+            windows = [SearchWindow(*middle, 0.85 * grown * wide, 0.75 * grown * wide, wide) for grown in (1.0, 1.6)]
         eye = next((eye for window in windows if (eye := view.opening(window, skin, *OPEN_EYE)) is not None), None)
         eyes.append(None if eye is None else view.completed(eye, windows[0].expected))
     codes = view.codes([mouth, *eyes], (MOUTH_REACH, EYE_REACH, EYE_REACH))

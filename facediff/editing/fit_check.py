@@ -32,29 +32,17 @@ TORN = 0.2  # Share of the lips' edges that may move otherwise
 
 @dataclass(frozen=True)
 class FitReport:
-    """Figures of a fit; None where the animation does not show it.
+    """Figures of a fit; None where the animation does not show it."""
 
-    Attributes:
-        lip_ratio: gap at rest over gap at the widest between the mesh's own lips; 0 is best.
-        opened: least opening of the mouth's left, middle and right third, as a share of the animation's own.
-        torn: share of the lips' edges that move otherwise than the animation's.
-        folded: share of the moving triangles that turn over in some frame.
-        crossed: share of pairs and frames in which upper and lower lip pass through one another.
-        covered: share of the animation's motion for which the mesh has a place.
-        eyes: the upper face's figures.
-        faults: a clause each; empty if the result can be used.
-        remarks: differences from the animation that are no fault, a clause each.
-    """
-
-    lip_ratio: float | None
-    opened: float | None
-    torn: float | None
-    folded: float
-    crossed: float | None
-    covered: float
-    eyes: EyeFigures | None
-    faults: tuple[str, ...]
-    remarks: tuple[str, ...] = ()
+    folded: float  # share of the moving triangles that turn over in some frame
+    covered: float  # share of the animation's motion for which the mesh has a place
+    eyes: EyeFigures | None  # the upper face's figures
+    faults: tuple[str, ...]  # a clause each; empty if the result can be used
+    remarks: tuple[str, ...]  # differences from the animation that are no fault, a clause each
+    lip_ratio: float | None = None  # gap at rest over gap at the widest between the mesh's own lips; 0 is best
+    opened: float | None = None  # least opening of the mouth's left, middle and right third, over the animation's own
+    torn: float | None = None  # share of the lips' edges that move otherwise than the animation's
+    crossed: float | None = None  # share of pairs and frames in which upper and lower lip pass through one another
 
     @property
     def good(self) -> bool:
@@ -84,54 +72,36 @@ def refuse_poor(source: object, report: FitReport) -> None:
 
 
 def check_fit(animation: Animation, carried: Animation, correspondence: Correspondence) -> FitReport:
-    """Measure an animation that was carried to another mesh against the original.
-
-    Args:
-        animation: on the source mesh; with triangles.
-        carried: the same on the target mesh.
-        correspondence: the correspondence that carried it.
-    """
-    scale = correspondence.similarity.scale
-    up = correspondence.similarity.rotation @ np.array([0.0, 1.0, 0.0])
+    """Measure an animation that a correspondence carried to another mesh against the original, with triangles."""
+    scale, rotation = correspondence.similarity.scale, correspondence.similarity.rotation
     frames = np.unique(np.linspace(0, len(animation.vertices) - 1, min(FRAMES, len(animation.vertices))).astype(int))
-    lip_ratio = opened = torn = crossed = None
-    faults = []
+    lips, faults = dict[str, float](), list[str]()
     source, target = correspondence.features
     if source is not None:
         pairs = source.lips(correspondence.source_vertices, LIPS)
-        rest = _gaps(animation.template[None], pairs)
+        rest = _gaps(animation.template[None], pairs)[0]
         moving = measured(animation.vertices, lambda vertices: _gaps(vertices, pairs))
-        source_gaps = np.concatenate([rest, moving])
-        mean = source_gaps.mean(axis=1)
-        widest = int(mean[1:].argmax())
+        mean = moving.mean(axis=1)
+        widest = int(mean.argmax())
         # Lips that are glued or torn show most where the mouth is widest.
         frames = np.unique(np.append(frames, widest))
-        opening = float(mean[1 + widest] - mean[0])
-        if opening * metres_per_unit(animation.unit) > SPEAKS:
-            laid = correspondence.laid.vertices
-            if target is None:
-                faults.append(
-                    "no line between its lips was found: triangles close its mouth, or it lies elsewhere; cut a closed "
-                    "mesh along the lips"
-                )
-            else:
-                facing = target.lips(laid, LIPS)
-                gaps = _gaps(np.stack([carried.template, carried.vertices[widest]]), facing)
-                lip_ratio = float(gaps[0].mean() / max(gaps.mean(axis=1).max(), 1e-12))
-                opened = _opened(gaps[1] - gaps[0], scale * (source_gaps[1 + widest] - source_gaps[0]))
-                torn = _torn(
-                    animation,
-                    carried,
-                    pairs,
-                    facing,
-                    widest,
-                    scale * correspondence.similarity.rotation,
-                    scale * opening,
-                )
-                crossed = _crossed(animation, carried, pairs, facing, frames, up, scale)
-                faults += _lip_faults(
-                    lip_ratio, max(LIP_RATIO, 1.3 * float(mean[0] / mean.max())), opened, torn, crossed
-                )
+        opening = float(mean[widest] - rest.mean())
+        if opening * metres_per_unit(animation.unit) > SPEAKS and target is None:
+            faults.append(
+                "no line between its lips was found: triangles close its mouth, or it lies elsewhere; cut a closed "
+                "mesh along the lips"
+            )
+        elif opening * metres_per_unit(animation.unit) > SPEAKS and target is not None:
+            facing = target.lips(correspondence.laid.vertices, LIPS)
+            gaps = _gaps(np.stack([carried.template, carried.vertices[widest]]), facing)
+            lips = {
+                "lip_ratio": float(gaps[0].mean() / max(gaps.mean(axis=1).max(), 1e-12)),
+                "opened": _opened(gaps[1] - gaps[0], scale * (moving[widest] - rest)),
+                "torn": _torn(animation, carried, pairs, facing, widest, scale * rotation, scale * opening),
+                "crossed": _crossed(animation, carried, pairs, facing, frames, rotation @ [0.0, 1.0, 0.0], scale),
+            }
+            most = max(float(rest.mean()), float(mean[widest]))
+            faults += _lip_faults(*lips.values(), limit=max(LIP_RATIO, 1.3 * (float(rest.mean()) / most)))
     frames = np.unique(np.append(frames, list(telling_frames(animation, correspondence).values()))).astype(int)
     folded = _folded(carried, correspondence.target_faces, frames)
     if folded > FOLDED + _folded(animation, animation.triangles.astype(np.int64), frames):
@@ -140,17 +110,7 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
     if covered < COVERED:
         faults.append(f"it has a place for {covered:.0%} of the animation's motion only")
     eyes, eye_faults, remarks = check_eyes(animation, carried, correspondence, frames)
-    return FitReport(
-        lip_ratio,
-        opened,
-        torn,
-        folded,
-        crossed,
-        covered,
-        eyes,
-        (*faults, *eye_faults),
-        tuple(remarks),
-    )
+    return FitReport(folded, covered, eyes, (*faults, *eye_faults), tuple(remarks), **lips)
 
 
 def telling_frames(animation: Animation, correspondence: Correspondence) -> dict[str, int]:
@@ -169,7 +129,7 @@ def telling_frames(animation: Animation, correspondence: Correspondence) -> dict
     return frames if brows is None else {**frames, "raised brows": brows}
 
 
-def _lip_faults(ratio: float, limit: float, opened: float, torn: float, crossed: float) -> list[str]:
+def _lip_faults(ratio: float, opened: float, torn: float, crossed: float, *, limit: float) -> list[str]:
     faults = []
     # A mouth that stands open at rest has a high ratio too; its opening tells it from a mouth with glued lips.
     if ratio > limit and (opened < CLEARLY_OPENS or torn > 0):

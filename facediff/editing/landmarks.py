@@ -6,6 +6,7 @@ a pair is the same landmark on the source and on the target.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,71 +22,38 @@ from facediff.utils.numerics import Array, Floats, Indices, Integers
 from facediff.utils.plain_files import load_json, read_table, write_json
 from facediff.utils.records import Text, read_record
 
-NAMES: dict[str, str] = {
-    "nose_tip": "where the nose reaches furthest forward",
-    "chin": "where the chin reaches furthest forward, in the middle",
-    "mouth_corner_left": "where the borders of both lips meet",
-    "mouth_corner_right": "where the borders of both lips meet",
-    "eye_outer_left": "the outer corner of the eye",
-    "eye_outer_right": "the outer corner of the eye",
-    "eye_inner_left": "the inner corner of the eye, next to the nose",
-    "eye_inner_right": "the inner corner of the eye, next to the nose",
-    "nose_bridge": "between the inner corners of the eyes, on the nose",
-    "nose_base": "where the nose meets the upper lip, in the middle",
-    "upper_lip_top": "the upper border of the upper lip, in the middle",
-    "lower_lip_bottom": "the lower border of the lower lip, in the middle",
-    "upper_lip_middle": "the edge of the upper lip, in the middle, just above the line between the lips",
-    "lower_lip_middle": "the edge of the lower lip, in the middle, just below the line between the lips",
+FLAME_VERTICES, CANONICAL_VERTICES = 5023, 468
+_TABLE: dict[str, tuple[str, int, int]] = {
+    "nose_tip": ("where the nose reaches furthest forward", 3564, 1),
+    "chin": ("where the chin reaches furthest forward, in the middle", 3487, 152),
+    "mouth_corner_left": ("where the borders of both lips meet", 1703, 291),
+    "mouth_corner_right": ("where the borders of both lips meet", 2820, 61),
+    "eye_outer_left": ("the outer corner of the eye", 1154, 263),
+    "eye_outer_right": ("the outer corner of the eye", 2428, 33),
+    "eye_inner_left": ("the inner corner of the eye, next to the nose", 3832, 362),
+    "eye_inner_right": ("the inner corner of the eye, next to the nose", 3631, 133),
+    "nose_bridge": ("between the inner corners of the eyes, on the nose", 3516, 168),
+    "nose_base": ("where the nose meets the upper lip, in the middle", 3556, 2),
+    "upper_lip_top": ("the upper border of the upper lip, in the middle", 3543, 0),
+    "lower_lip_bottom": ("the lower border of the lower lip, in the middle", 3503, 17),
+    "upper_lip_middle": ("the edge of the upper lip, in the middle, just above the line between the lips", 3531, 13),
+    "lower_lip_middle": ("the edge of the lower lip, in the middle, just below the line between the lips", 3504, 14),
 }
+NAMES = {name: place for name, (place, _, _) in _TABLE.items()}
 """Every name and the place that it stands for, in the order in which the places are best picked."""
 LEFT, RIGHT = "_left", "_right"
 
-FLAME_VERTICES = 5023
-FLAME: dict[str, int] = {
-    "nose_tip": 3564,
-    "chin": 3487,
-    "mouth_corner_left": 1703,
-    "mouth_corner_right": 2820,
-    "eye_outer_left": 1154,
-    "eye_outer_right": 2428,
-    "eye_inner_left": 3832,
-    "eye_inner_right": 3631,
-    "nose_bridge": 3516,
-    "nose_base": 3556,
-    "upper_lip_top": 3543,
-    "lower_lip_bottom": 3503,
-    "upper_lip_middle": 3531,
-    "lower_lip_middle": 3504,
-}
+FLAME = {name: vertex for name, (_, vertex, _) in _TABLE.items()}
 """Vertices of FLAME's topology (VOCASET, 3DMEAD and others of 5023 vertices).
 
 All but two are the vertices that SAiD publishes for the 68 landmarks of iBUG 300-W (github.com/yunik1004/SAiD,
 ``data/FLAME_landmarks.txt``; numbers 30, 54, 48, 45, 36, 42, 39, 33, 51, 57, 62 and 66 from 0). The chin and the bridge
 of the nose are vertices of the middle of the published template (github.com/yfeng95/DECA, ``data/head_template.obj``):
-the one that reaches furthest forward below the mouth, and the one at the height of the inner corners of the eyes. In
-that template left and right are mirror images of one another, and the others lie in its middle.
-
-No list was found for BIWI (23370 vertices), and Multiface's authors say that there is none for theirs
+the one that reaches furthest forward below the mouth, and the one at the height of the inner corners of the eyes. No
+list was found for BIWI (23370 vertices), and Multiface's authors say that there is none for theirs
 (github.com/facebookresearch/multiface, issue 21): :func:`landmarks_by_shape` finds some of theirs.
 """
-
-CANONICAL_VERTICES = 468
-CANONICAL: dict[str, int] = {
-    "nose_tip": 1,
-    "chin": 152,
-    "mouth_corner_left": 291,
-    "mouth_corner_right": 61,
-    "eye_outer_left": 263,
-    "eye_outer_right": 33,
-    "eye_inner_left": 362,
-    "eye_inner_right": 133,
-    "nose_bridge": 168,
-    "nose_base": 2,
-    "upper_lip_top": 0,
-    "lower_lip_bottom": 17,
-    "upper_lip_middle": 13,
-    "lower_lip_middle": 14,
-}
+CANONICAL = {name: vertex for name, (_, _, vertex) in _TABLE.items()}
 """Vertices of MediaPipe's canonical face, which the corpora of ``facediff data track`` have."""
 
 
@@ -123,15 +91,10 @@ def puppet_landmarks() -> dict[str, int]:
 
 @dataclass(frozen=True)
 class LandmarkTemplate:
-    """The named places of a mesh.
+    """The named places of a mesh."""
 
-    Attributes:
-        topology: puppet, FLAME or people; None where the places were found by the mesh's shape.
-        vertices: vertex of each name, in the order of :data:`NAMES`; names that are not known are absent.
-    """
-
-    topology: str | None
-    vertices: dict[str, int]
+    topology: str | None  # puppet, FLAME or people; None where the places were found by the mesh's shape
+    vertices: dict[str, int]  # of each name that is known, in the order of :data:`NAMES`
 
     @property
     def missing(self) -> list[str]:
@@ -140,24 +103,19 @@ class LandmarkTemplate:
 
 
 def known_landmarks(vertices: Floats, faces: Integers) -> LandmarkTemplate:
-    """The named landmarks of a mesh, by its topology or by its shape.
+    """The named landmarks of a mesh (V, 3), (F, 3), by its topology or, with y up and z to the viewer, by its shape.
 
     A topology is recognised by the number of its vertices, and by its landmarks: left and right must be mirror images,
     with the others between them, so that a mesh with reordered vertices is not mistaken for the original.
-
-    Args:
-        vertices: (V, 3); where the topology is not known, y up and z to the viewer, as animations are.
-        faces: (F, 3).
 
     Example:
         >>> head = build_head()
         >>> known_landmarks(head.vertices, head.faces).topology
         'puppet'
     """
-    by_topology = known_topology(vertices)
-    if by_topology is not None:
-        return by_topology
-    return LandmarkTemplate(None, landmarks_by_shape(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)))
+    return known_topology(vertices) or LandmarkTemplate(
+        None, landmarks_by_shape(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
+    )
 
 
 def known_topology(vertices: Floats) -> LandmarkTemplate | None:
@@ -206,13 +164,7 @@ EYES_ABOVE = 1.4  # Height of the eyes above the mouth, in widths of an average 
 
 
 def landmarks_by_shape(vertices: Array, faces: Indices, features: Features | None = None) -> dict[str, int]:
-    """Vertices of the names that a mesh's openings show: corners and middle of the mouth, corners of the eyes, nose.
-
-    Args:
-        vertices: (V, 3), y up and z to the viewer.
-        faces: (F, 3).
-        features: of this mesh; found if None.
-    """
+    """Vertices of the names that a mesh's openings show: corners and middle of the mouth, corners of the eyes, nose."""
     features = features or find_features(vertices, faces)
     if features is None:
         return {}
@@ -295,20 +247,11 @@ class Landmarks:
         """How many there are."""
         return len(self.names)
 
-    @property
-    def nearest_vertices(self) -> Indices:
-        """(L, 2) the vertices of both meshes that weigh most in each place."""
-        columns = [side.corners[np.arange(len(self)), side.weights.argmax(axis=1)] for side in self._sides]
-        return np.stack(columns, axis=1)
-
-    @property
-    def _sides(self) -> tuple[SurfacePoints, SurfacePoints]:
-        return self.source, self.target
-
     def check(self, source_vertices: int, target_vertices: int, where: object = "landmarks") -> None:
         """Refuse vertices that do not exist."""
-        for name, points, count in zip(
-            ("source", "target"), self._sides, (source_vertices, target_vertices), strict=True
+        for name, points, count in (
+            ("source", self.source, source_vertices),
+            ("target", self.target, target_vertices),
         ):
             if len(self) and not 0 <= points.corners.min() <= points.corners.max() < count:
                 raise FaceDiffError(
@@ -317,16 +260,10 @@ class Landmarks:
 
     def refuse_contradictions(self, where: object) -> None:
         """Refuse pairs of one place with several places of the other mesh; the same pair may be repeated."""
-        points = [list(map(str, np.hstack([side.corners, side.weights]).tolist())) for side in self._sides]
-        for name, one, opposite in (("source", *points), ("target", *reversed(points))):
-            partners: dict[str, int] = {}
-            for number, (point, partner) in enumerate(zip(one, opposite, strict=True)):
-                first = partners.setdefault(point, number)
-                if opposite[first] != partner:
-                    raise FaceDiffError(
-                        f"{where}: pairs {first + 1} and {number + 1} give one place of the {name} mesh two places of "
-                        f"the other mesh; keep one of them"
-                    )
+        places = [np.hstack([side.corners, side.weights]) for side in (self.source, self.target)]
+        pairs = len(np.unique(np.hstack(places), axis=0))
+        if any(len(np.unique(side, axis=0)) < pairs for side in places):
+            raise FaceDiffError(f"{where}: gives one place of a mesh two places of the other mesh; keep one of them")
 
 
 def common_landmarks(source: Floats, target: Floats) -> Landmarks | None:
@@ -341,7 +278,7 @@ def common_landmarks(source: Floats, target: Floats) -> Landmarks | None:
 
 FORMAT = "facediff landmarks 1"
 MOST, LONGEST_NAME = 1000, 60
-DIGITS = 18  # of a whole number that fits into 64 bits
+VERTEX = re.compile("[0-9]{1,18}")  # fits into 64 bits
 EXAMPLE = "`source vertex,target vertex`, counted from 0, or a name of both such as `nose_tip,4034`"
 
 
@@ -368,17 +305,16 @@ def read_landmarks(
     names, pairs = [], []
     for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
         cells = [cell.strip() for cell in line if cell.strip()]
-        has_name = any(cell in NAMES for cell in cells)
-        if not cells or (number == 1 and not has_name and not any(map(is_number, cells))):
-            continue
-        if len(cells) == 1 and has_name:
+        if not cells or (number == 1 and all(cell[0].isalpha() and cell not in NAMES for cell in cells)):
+            continue  # nothing, or the header
+        if len(cells) == 1 and cells[0] in NAMES:
             cells = cells * 2
-        if len(cells) != 2 or not all(cell in NAMES or _whole(cell) for cell in cells):
+        if len(cells) != 2 or not all(cell in NAMES or VERTEX.fullmatch(cell) for cell in cells):
             wrong = next((cell for cell in cells if cell.isidentifier() and cell not in NAMES), None)
             remedy = f'there is no name "{wrong}": {choices(wrong, NAMES)}' if wrong else f"expected {EXAMPLE}"
             raise FaceDiffError(f"{path}: line {number} is {','.join(line)}; {remedy}")
         row = [
-            int(cell) if _whole(cell) else _vertex_of(cell, template, side, path)
+            int(cell) if cell.isdecimal() else _vertex_of(cell, template, side, path)
             for cell, template, side in zip(cells, (source, target), ("source", "target"), strict=True)
         ]
         pairs.append(row)
@@ -388,19 +324,6 @@ def read_landmarks(
     landmarks = Landmarks.of_vertices(np.array(pairs, np.int64), names)
     landmarks.refuse_contradictions(path)
     return landmarks
-
-
-def is_number(word: str) -> bool:
-    """Whether a cell is a number of any kind, so that its line is no header; also ``nan``, which is no vertex."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _whole(word: str) -> bool:
-    return word.isascii() and word.isdecimal() and len(word) <= DIGITS
 
 
 def _vertex_of(name: str, template: LandmarkTemplate | None, side: str, where: object) -> int:

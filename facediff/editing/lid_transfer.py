@@ -115,10 +115,10 @@ class EyeLids:
 
     source: LidEdges
     source_field: LidField
-    target: LidEdges | None  # None where the target's lids rest
-    target_field: LidField
-    ball: EyeballDepth | None
-    clearance: Array  # (N,) how far in front of the eyeball the vertices of the target's field stay
+    target: LidEdges | None = None  # None where the target's lids rest
+    target_field: LidField | None = None
+    ball: EyeballDepth | None = None
+    clearance: Array | None = None  # (N,) how far in front of the eyeball the vertices of the target's field stay
 
     def target_edges(self, moves: Array) -> Array:
         """Displacements (T, 2, SAMPLES, 3) of the target's edges, from the source's along its axes."""
@@ -154,13 +154,9 @@ class EyeLids:
 def eye_lids(
     source: Surface, laid: Surface, features: tuple[Features, Features], *, at_rest: bool
 ) -> list[EyeLids] | None:
-    """The lids of both eyes; None if the source's are not known.
+    """The lids of both eyes of the animation's face and of a mesh that is laid onto it; None if the face's are unknown.
 
-    Args:
-        source: the animation's face.
-        laid: the mesh in its place, with all of its triangles.
-        features: openings of both.
-        at_rest: whether the target's lids stay at rest; so they do where one of its eyes has no opening.
+    The mesh's lids stay at rest if it is asked for, and where one of its eyes has no opening.
     """
     source_edges = [lid_edges(source.vertices, features[0], eye) for eye in (0, 1)]
     if source_edges[0] is None or source_edges[1] is None:
@@ -171,15 +167,13 @@ def eye_lids(
     lids = []
     for eye, (one, two, ball) in enumerate(zip(source_edges, target_edges, balls, strict=True)):
         assert one is not None  # noqa: S101 - for type checkers
-        nothing = LidField(
-            np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 2)), np.eye(3)
-        )
-        field = nothing if rest or two is None else _field(laid.vertices, features[1], eye, two)
-        clearance = np.zeros(0)
-        if ball is not None and two is not None:
-            clearance = _clearance(laid, field, ball, two.opening.width)
         source_field = _field(source.vertices, features[0], eye, one, SOURCE_REACH)
-        lids.append(EyeLids(one, source_field, None if rest else two, field, ball, clearance))
+        if rest or two is None:
+            lids.append(EyeLids(one, source_field))
+            continue
+        field = _field(laid.vertices, features[1], eye, two)
+        clearance = None if ball is None else _clearance(laid, field, ball, two.opening.width)
+        lids.append(EyeLids(one, source_field, two, field, ball, clearance))
     return lids
 
 
@@ -364,11 +358,11 @@ def without_lids(lids: list[EyeLids], displacements: Array) -> tuple[Array, list
 def with_lids(lids: list[EyeLids], vertices: Array, displacements: Array, edges: list[Array]) -> None:
     """Add the lids' motion to displacements (T, Vt, 3) of a target's vertices (Vt, 3), both in the source's axes."""
     for eye, moves in zip(lids, edges, strict=True):
-        if eye.target is None:
+        if eye.target_field is None:
             continue
         some = eye.target_field.vertices
         displacements[:, some] += eye.target_field.share[:, None] * eye.target_field.moved(eye.target_edges(moves))
-        if eye.ball is not None:
+        if eye.ball is not None and eye.clearance is not None:
             # The way of a lid is straight and the eyeball is round: what would dive into it slides over it.
             points = vertices[some] + displacements[:, some]
             into = eye.ball.at(points) + eye.clearance - points[..., 2]
@@ -382,20 +376,13 @@ def swing(
 
     A lid turns about the eyeball's centre, and what grows from its edge turns with it: lashes that were only shifted
     would stick out of a shut eye. The plate in a lid is stiff, so that all of it turns as its middle does, also near
-    the corners, where the edge hardly moves.
-
-    Args:
-        lids: of both eyes.
-        vertices: (Vt, 3) of the target at rest.
-        lashes: (A,) vertices of lashes.
-        roots: (A, 3) the vertices at the edges of the lids between which they grow.
-        weights: (A, 3) of the roots.
-        displacements: (T, Vt, 3) of the target's vertices.
+    the corners, where the edge hardly moves. Lashes (A,) of a target at rest (Vt, 3) grow at roots, weighted places
+    between vertices (A, 3) at the edges of the lids; displacements are of the target's vertices (T, Vt, 3).
     """
     turned = np.zeros((len(displacements), len(lashes), 3))
     arms = vertices[lashes] - np.einsum("ak,akd->ad", weights, vertices[roots])
     for eye in lids:
-        if eye.target is None:
+        if eye.target is None or eye.target_field is None:
             continue
         field = eye.target_field
         # Both edges end in the corners, which belong to neither lid.

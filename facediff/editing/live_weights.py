@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from facediff.animation import Animation, metres_per_unit
+from facediff.animation import Animation
 from facediff.editing.blendshapes import AROUND, SolveOptions, moving_shapes, objective
 from facediff.editing.bounded import ACTIVE, Pivoting
 from facediff.editing.shapes import ShapeSet
@@ -26,15 +26,11 @@ class FrameSolver:
     - A shape that gains less than it costs is at 0 until the frame in which it begins to work. It fades for as long as
       there; it does not begin before.
 
-    Constants are computed once: the matrix of the shapes, the projection of vertices on them (a frame's only product
-    over vertices), and the inverses of its parts, see :class:`~facediff.editing.bounded.Pivoting`.
-
     Args:
         shapes: K shapes of the face's topology.
         frame_rate: frames a second.
         faces: triangles (F, 3) for weights by area; None to count all vertices alike.
         regions: vertices by name, for ``options.region``.
-        unit: of length, for :meth:`residual_mm`.
         options: the usual ones if None; `residual_limit` has no meaning here.
 
     Example:
@@ -51,13 +47,12 @@ class FrameSolver:
         *,
         faces: npt.NDArray[np.int32] | None = None,
         regions: Mapping[str, Indices] | None = None,
-        unit: str = "m",
         options: SolveOptions | None = None,
     ) -> None:
         self.shapes = shapes
         self.options = options = options or SolveOptions()
         rest = shapes.neutral.astype(np.float32)
-        face = Animation("shapes", rest[None], rest, frame_rate, faces=faces, regions=dict(regions or {}), unit=unit)
+        face = Animation("shapes", rest[None], rest, frame_rate, faces=faces, regions=dict(regions or {}))
         self._moving = moving = moving_shapes(face, shapes, options)
         terms = objective(moving, shapes, options, frame_rate)
         self._scale, self._coupling = terms.scale, terms.coupling
@@ -74,7 +69,6 @@ class FrameSolver:
             terms.projection.reshape(len(matrix), -1, 3)[:, moved].reshape(len(matrix), -1)
         )
         self._all = len(self._used) == len(rest)
-        self._millimetres = 1000.0 * metres_per_unit(unit)
         self.reset()
 
     def reset(self) -> None:
@@ -83,11 +77,7 @@ class FrameSolver:
         self._idle = np.full(len(self._scale), self._fading + 1)
 
     def solve(self, offsets: Floats) -> Array:
-        """The weights (K,) of the next frame, in the order of the shapes' names.
-
-        Args:
-            offsets: (V, 3) of the vertices from the neutral face.
-        """
+        """The weights (K,) of the next frame, with offsets (V, 3) from the neutral face; in the order of the names."""
         moving = offsets if self._all else offsets[self._used]
         right = self._projection @ moving.reshape(-1).astype(np.float64)
         if not np.isfinite(right).all():
@@ -104,9 +94,3 @@ class FrameSolver:
         # Division may lead past a bound by a rounding error.
         weights[self._moving.indices] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
         return weights
-
-    def residual_mm(self, offsets: Floats, weights: Array) -> float:
-        """Root-mean-square distance over the vertices that count that weights (K,) leave of offsets (V, 3), in mm."""
-        moving = self._moving
-        left = np.asarray(offsets, np.float64)[moving.vertices].reshape(-1) - weights[moving.indices] @ moving.deltas
-        return self._millimetres * float(np.sqrt(np.square(left).sum() / len(moving.vertices)))

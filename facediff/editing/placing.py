@@ -134,8 +134,8 @@ def _towards_planes(
 
 # Where the source's face is known, it alone is searched for: the other mesh may be a mask or a whole figure.
 
-HALF_WIDTH, BELOW, ABOVE = 1.3, 0.8, 2.3
-"""The face about a mouth's middle, in widths of the mouth."""
+FACE_WINDOW = (-1.3, -0.8), (1.3, 2.3)
+"""Corners of the face about a mouth's middle, in widths of the mouth."""
 PATCH_STEP = 1 / 14  # Distance of the face's points, as a share of the mouth's width
 FEW, MANY = 120, 400  # Points of the face by which starts are compared, and refined
 MOST_GROUPS, LEAST_GROUP = 8, 40
@@ -244,11 +244,7 @@ def _face_of(surface: Surface, features: Features) -> tuple[Array, Array]:
     """Points (N, 3), evenly spread in the view from the front, and normals of the skin about the mouth and the eyes."""
     view = FrontView(surface.vertices, surface.faces)
     width = features.mouth.width
-    x, y, _ = features.mouth.centre
-    low, high = (
-        np.array([x - HALF_WIDTH * width, y - BELOW * width]),
-        np.array([x + HALF_WIDTH * width, y + ABOVE * width]),
-    )
+    low, high = (features.mouth.centre[:2] + np.array(way) * width for way in FACE_WINDOW)
     step = PATCH_STEP * width
     columns, rows = np.ceil((high - low) / step).astype(int)
     number, _, weights = view.raster(view.within(low, high, features.skin), low, step, int(columns), int(rows))
@@ -294,10 +290,8 @@ def _candidates_for(
         similar = Similarity(state[0][k], state[1][k], float(state[2][k]))
         laid = similar.apply(points[many])
         # Several starts end in one place.
-        if all(
-            np.abs(laid - candidate.apply(points[many])).max() > 0.1 * width * candidate.scale
-            for _, candidate in candidates
-        ):
+        others = (np.abs(laid - other.apply(points[many])).max() / other.scale for _, other in candidates)
+        if all(away > 0.1 * width for away in others):
             candidates.append((float(apart[k]), similar))
     return candidates
 
@@ -312,7 +306,7 @@ def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple
     groups: list[tuple[Array, Array | None, tuple[float, ...]]] = [(moved.vertices[vertices], None, (0.75, 1.0, 1.33))]
     parts = [moved.vertices[vertices[pieces[vertices] == name]] for name in names]
     groups += [(part, None, (1.0,)) for part in parts if LEAST_GROUP <= len(part) < len(vertices)]
-    for part in (moved.vertices[vertices], *(part for part in parts if LEAST_GROUP <= len(part) < len(vertices))):
+    for part in [group for group, _, _ in groups]:
         extent = np.ptp(part, axis=0)
         for axis, sign in itertools.product(range(3), (1, -1)):
             # Much longer than wide: a figure or a bust, with the face at one end.
@@ -335,11 +329,8 @@ def _starts(moved: Surface, goal: Surface, points: Array, turns: Array) -> tuple
                 starts.append((turn, end.mean(axis=0) - scale * turn @ goal_points.mean(axis=0), scale))
             scale = size / face_size(points)  # a mask shows no more than the face
             starts.append((turn, 0.5 * (low + high) - scale * turn @ (0.5 * (points.min(0) + points.max(0))), scale))
-    return (
-        np.stack([start[0] for start in starts]),
-        np.stack([start[1] for start in starts]),
-        np.array([start[2] for start in starts]),
-    )
+    rotation, shift, scales = zip(*starts, strict=True)
+    return np.stack(rotation), np.stack(shift), np.array(scales)
 
 
 def _round(
@@ -361,9 +352,8 @@ def _round(
     enough = weights.sum(axis=1) >= 0.2 * len(points)
     weights[~enough] = 1.0
     new = _similarities(points, tree.data[index], weights)
-    keep = ~enough
     for one, old in zip(new, state, strict=True):
-        one[keep] = old[keep]
+        one[~enough] = old[~enough]
     return new, apart
 
 

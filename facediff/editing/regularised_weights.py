@@ -29,22 +29,13 @@ EXCLUDED = 1e-10
 
 @dataclass(frozen=True)
 class Regularisation:
-    """Strengths of the terms, for a face of a certain size; the defaults are NVIDIA's.
+    """Strengths of the terms, for a face of a certain size; the defaults are NVIDIA's."""
 
-    Attributes:
-        l1: keeps the sum of the weights small.
-        l2: keeps each weight small.
-        temporal: keeps weights near the frame before.
-        symmetry: keeps the weights of a symmetric pair alike.
-        template_size: diagonal of the face for which the strengths are stated; they grow with the square of the size.
-        temporal_term: ``published`` or ``corrected``.
-    """
-
-    l1: float = 1.0
-    l2: float = 3.5
-    temporal: float = 0.0
-    symmetry: float = 100.0
-    template_size: float = 54.7
+    l1: float = 1.0  # keeps the sum of the weights small
+    l2: float = 3.5  # keeps each weight small
+    temporal: float = 0.0  # keeps weights near the frame before
+    symmetry: float = 100.0  # keeps the weights of a symmetric pair alike
+    template_size: float = 54.7  # diagonal of the face that the strengths are for; they grow with the square of it
     temporal_term: TemporalTerm = "published"
 
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.animation import allocate_like, stretches_of
 from facediff.editing.correspondence import (
-    LIDS_AS_ALL,
     LIDS_AT_REST,
-    LIDS_FITTED,
+    NO_INDICES,
     Correspondence,
     averaging,
     correspond,
@@ -176,21 +174,18 @@ def parts_with_a_face(animation: Animation, path: Path, mesh: Mesh) -> list[str]
     """Names of the parts of a file, the first name of each, in which a mouth is where the animation's face has it."""
     source = Surface(np.asarray(animation.template, np.float64), animation.triangles.astype(np.int64))
     features = find_features(source.vertices, source.faces)
+    triangles: dict[str, Indices] = {}
     parts = [part for part in mesh_parts(path) if part.names]
-    if features is None or len(parts) < 2:
-        return []
-    names = []
-    triangles: dict[str, list[Indices]] = {}
-    for part in parts:
-        triangles.setdefault(part.names[0], []).append(part.triangles)
-    largest = sorted(triangles, key=lambda name: -sum(len(some) for some in triangles[name]))
-    for name in largest[:MOST_PARTS]:
-        faces = np.asarray(mesh.faces, np.int64)[np.concatenate(triangles[name])]
-        if len(faces) >= LEAST_PART:
-            target = run_alike(source, Surface(np.asarray(mesh.vertices, np.float64), faces))
-            if place_face(target, source, features)[1] is not None:
-                names.append(name)
-    return names
+    for part in parts if features is not None and len(parts) > 1 else []:
+        triangles[part.names[0]] = np.append(triangles.get(part.names[0], NO_INDICES), part.triangles)
+
+    def shows_a_face(name: str) -> bool:
+        faces = np.asarray(mesh.faces, np.int64)[triangles[name]]
+        target = run_alike(source, Surface(np.asarray(mesh.vertices, np.float64), faces))
+        return features is not None and place_face(target, source, features)[1] is not None
+
+    largest = sorted(triangles, key=lambda name: -len(triangles[name]))[:MOST_PARTS]
+    return [name for name in largest if len(triangles[name]) >= LEAST_PART and shows_a_face(name)]
 
 
 def transfer_checked(
@@ -204,35 +199,28 @@ def transfer_checked(
     """
     still = animation.still()
 
-    def turned_as_the_head(moved: Animation, fit: Correspondence) -> Animation:
-        return _with_head(moved, animation.head, fit, whole_head)
-
     carried = transfer(still, correspondence, target)
     report = check_fit(still, carried, correspondence)
-    faults = report.faults
-    for lids in (LIDS_FITTED, LIDS_AT_REST):
-        if report.good or report.eyes is None or correspondence.lids >= lids:
-            continue
-        variant = replace(correspondence, lids=lids)
-        moved = transfer(still, variant, target)
-        again = check_fit(still, moved, variant)
-        if again.good:
-            why = [f"lids in motion were worse: {faults[0]}"] if lids == LIDS_AT_REST else []
-            return turned_as_the_head(moved, variant), variant, replace(again, remarks=(*again.remarks, *why))
-    return turned_as_the_head(carried, correspondence), correspondence, report
+    if not report.good and report.eyes is not None:
+        for lids in range(correspondence.lids + 1, LIDS_AT_REST + 1):
+            variant = replace(correspondence, lids=lids)
+            moved = transfer(still, variant, target)
+            again = check_fit(still, moved, variant)
+            if again.good:
+                if lids == LIDS_AT_REST:
+                    worse = f"lids in motion were worse: {report.faults[0]}"
+                    again = replace(again, remarks=(*again.remarks, worse))
+                carried, correspondence, report = moved, variant, again
+                break
+    return _with_head(carried, animation.head, correspondence, whole_head), correspondence, report
 
 
 def transfer(animation: Animation, correspondence: Correspondence, target: Mesh, whole_head: bool = False) -> Animation:
     """The motion of an animation of the correspondence's source mesh, of any identity, on its target mesh.
 
-    The target's vertices, triangles and colours are kept as they are; its unit follows from how large it is.
-
-    Args:
-        animation: of any identity.
-        correspondence: between both meshes.
-        target: the mesh.
-        whole_head: whether all of a figure moves as its head does, so that the motion of the head can be taken off
-            again, as weights of shapes need it; else its body stands still.
+    The target's vertices, triangles and colours are kept as they are; its unit follows from how large it is. With
+    ``whole_head``, all of a figure moves as its head does, so that the motion of the head can be taken off again, as
+    weights of shapes need it; else its body stands still.
     """
     refuse_other_mesh(
         animation.name,
@@ -486,37 +474,16 @@ def _about_what_moves(neutral: Array, points: Array, faces: Indices) -> Indices:
 # Correspondences on disk.
 
 FORMAT = "facediff correspondence 2"
-ARRAYS = {
-    "corners": ("i", 2),
-    "weights": ("f", 2),
-    "distances": ("f", 1),
-    "trust": ("f", 1),
-    "share": ("f", 1),
-    "source_vertices": ("f", 2),
-    "source_faces": ("i", 2),
-    "target_vertices": ("f", 2),
-    "target_faces": ("i", 2),
-    "hidden": ("i", 1),
-    "followers": ("i", 1),
-    "follower_corners": ("i", 2),
-    "follower_weights": ("f", 2),
-    "lids": ("i", 0),
-}
-SIMILARITY = {"rotation": ("f", 2), "translation": ("f", 1), "scale": ("f", 0)}
-"""Kind and number of axes of each array in the file."""
+SIMILARITY = ("rotation", "translation", "scale")
+ARRAYS = tuple(field.name for field in fields(Correspondence) if field.name != "similarity")
 
 
 def save_correspondence(path: Path, correspondence: Correspondence) -> None:
     """Write a correspondence as .npz, which ``numpy.load`` opens without pickle."""
-    similarity = correspondence.similarity
+    content = {name: np.asarray(getattr(correspondence, name)) for name in ARRAYS}
+    content |= {name: np.asarray(getattr(correspondence.similarity, name)) for name in SIMILARITY}
     with atomic(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(
-            stream,
-            allow_pickle=False,
-            format=np.array(FORMAT),
-            **{name: np.asarray(getattr(similarity, name)) for name in SIMILARITY},
-            **{name: np.asarray(getattr(correspondence, name)) for name in ARRAYS},
-        )
+        np.savez_compressed(stream, allow_pickle=False, format=np.array(FORMAT), **content)
 
 
 def load_correspondence(path: Path) -> Correspondence:
@@ -524,46 +491,12 @@ def load_correspondence(path: Path) -> Correspondence:
     arrays = read_arrays(path)
     check_format(path, str(arrays.get("format")), FORMAT)
     with damaged(path, "make a new correspondence"):
-        kinds = {**ARRAYS, **SIMILARITY}
-        unfit = [name for name, (kind, axes) in kinds.items() if not _is_array(arrays[name], kind, axes)]
-        correspondence = Correspondence(
-            **{name: arrays[name] for name in ARRAYS if name != "lids"},
-            lids=int(arrays["lids"]),
-            similarity=Similarity(arrays["rotation"], arrays["translation"], float(arrays["scale"])),
-        )
-        if unfit or not _consistent(correspondence):
-            raise ValueError(f"{' and '.join(unfit) or 'its arrays'} are damaged or do not match one another")
+        content: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
+        rotation, translation, scale = (arrays[name] for name in SIMILARITY)
+        content |= {"lids": int(arrays["lids"]), "similarity": Similarity(rotation, translation, float(scale))}
+        correspondence = Correspondence(**content)
+        # Vertices beyond the mesh's would be an error, and those counted from its end another place without a word.
+        for name in ("corners", "source_faces", "target_faces", "hidden", "followers", "follower_corners"):
+            if arrays[name].min(initial=0) < 0:
+                raise ValueError(f"{name} is damaged")
     return correspondence
-
-
-def _is_array(array: npt.NDArray[np.generic], kind: str, axes: int) -> bool:
-    return array.dtype.kind == kind and array.ndim == axes and bool(np.isfinite(array).all())
-
-
-def _consistent(parts: Correspondence) -> bool:
-    """Whether shapes and indices of all arrays match."""
-    sources, targets, followers = len(parts.source_vertices), len(parts.target_vertices), len(parts.followers)
-    shapes = {
-        **{"source_vertices": (sources, 3), "source_faces": (len(parts.source_faces), 3)},
-        **{"target_vertices": (targets, 3), "target_faces": (len(parts.target_faces), 3)},
-        **dict.fromkeys(("corners", "weights"), (targets, 3)),
-        **dict.fromkeys(("distances", "trust", "share"), (targets,)),
-        **dict.fromkeys(("follower_corners", "follower_weights"), (followers, 3)),
-    }
-    limits = {
-        **dict.fromkeys(("source_faces", "corners"), sources),
-        **dict.fromkeys(("target_faces", "followers", "follower_corners"), targets),
-        "hidden": len(parts.target_faces),
-    }
-    arrays = {name: getattr(parts, name) for name in {**shapes, **limits}}
-    return (
-        all(arrays[name].shape == shape for name, shape in shapes.items())
-        and all(
-            arrays[name].min(initial=0) >= 0 > arrays[name].max(initial=0) - limit for name, limit in limits.items()
-        )
-        and min(len(parts.source_faces), len(parts.target_faces), targets) > 0
-        and parts.lids in (LIDS_AS_ALL, LIDS_FITTED, LIDS_AT_REST)
-        and parts.similarity.rotation.shape == (3, 3)
-        and parts.similarity.translation.shape == (3,)
-        and parts.similarity.scale > 0
-    )

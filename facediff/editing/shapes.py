@@ -27,19 +27,12 @@ STILL = 1e-6  # A shape that moves no vertex by more than this share of the face
 
 @dataclass(frozen=True, eq=False)
 class ShapeSet:
-    """Blendshapes of one face.
+    """Blendshapes of one face."""
 
-    Attributes:
-        names: K names; ARKit's own spelling where they are ARKit's.
-        neutral: (V, 3) the face at rest, in the animation's unit.
-        deltas: (K, V, 3) displacement of each vertex at weight 1.
-        notes: findings and changes on reading, a sentence each.
-    """
-
-    names: tuple[str, ...]
-    neutral: Array
-    deltas: Array
-    notes: tuple[str, ...] = ()
+    names: tuple[str, ...]  # K names; ARKit's own spelling where they are ARKit's
+    neutral: Array  # (V, 3) the face at rest, in the animation's unit
+    deltas: Array  # (K, V, 3) displacement of each vertex at weight 1
+    notes: tuple[str, ...] = ()  # findings and changes on reading, a sentence each
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -98,11 +91,8 @@ def read_shapes(path: Path, template: Floats, unit: str = "m") -> ShapeSet:
         template: (V, 3) the animation's neutral face.
         unit: the template's unit of length.
     """
-    if is_built_in(path):
-        files = built_in_files(np.asarray(template, np.float64) * metres_per_unit(unit))
-    else:
-        files = read_shape_files(path, len(template))
-    return fitted(files, template, unit)
+    metres = np.asarray(template, np.float64) * metres_per_unit(unit)
+    return fitted(built_in_files(metres) if is_built_in(path) else read_shape_files(path, len(metres)), template, unit)
 
 
 def fitted(files: ShapeFiles, template: Floats, unit: str = "m") -> ShapeSet:

@@ -90,6 +90,22 @@ def vertex_normals(vertices: Array, faces: Indices) -> Array:
     return np.asarray(Trimesh(vertices, faces, process=False).vertex_normals, np.float64)
 
 
+def edges_of(faces: Indices) -> Indices:
+    """Edges (E, 2), each once."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    return edges[edges[:, 0] != edges[:, 1]]
+
+
+def components(edges: Indices, count: int) -> Indices:
+    """A label (count,) for each vertex, equal for those that edges (E, 2) join."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(joined, directed=False)[1], np.int64)
+
+
 def triangle_normals(points: Array, faces: Integers) -> Array:
     """Normals (F, 3) of triangles, as long as twice their areas."""
     a, b, c = (points[faces[:, corner]] for corner in range(3))

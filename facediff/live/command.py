@@ -70,9 +70,7 @@ def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:
     from facediff.editing.shapes import read_shapes
 
     shape_set = read_shapes(shapes, model.neutral, model.unit)
-    frame_solver = FrameSolver(
-        shape_set, model.frame_rate, faces=model.faces if len(model.faces) else None, regions={}, unit=model.unit
-    )
+    frame_solver = FrameSolver(shape_set, model.frame_rate, faces=model.faces if len(model.faces) else None, regions={})
     return shape_set.names, lambda offsets: frame_solver.solve(offsets).astype("float32")
 
 

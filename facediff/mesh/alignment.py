@@ -24,17 +24,11 @@ DEGENERATE = 1e-12
 
 @dataclass(frozen=True)
 class Similarity:
-    """x → scale · rotation x + translation.
+    """x → scale · rotation x + translation."""
 
-    Attributes:
-        rotation: (3, 3) proper rotation.
-        translation: (3,), in the unit of the target.
-        scale: target units to a source unit.
-    """
-
-    rotation: Array
-    translation: Array
-    scale: float = 1.0
+    rotation: Array  # (3, 3) proper
+    translation: Array  # (3,), in the unit of the target
+    scale: float = 1.0  # target units to a source unit
 
     def apply(self, points: Floats) -> Array:
         """Map points (..., 3), in float64."""
@@ -202,19 +196,12 @@ ANCHORS = 2000  # As many vertices, evenly spread over the list, are enough to a
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Result of :func:`remove_rigid_motion`.
+    """Result of :func:`remove_rigid_motion`."""
 
-    Attributes:
-        frames: (T, V, 3) the frames aligned with the target.
-        rotations: (T, 3, 3) from a frame to the target.
-        translations: (T, 3); frame t is moved to ``frames[t] @ rotations[t].T + translations[t]``.
-        residuals: (T,) root-mean-square distance of the stable vertices from the target that is left.
-    """
-
-    frames: Floats
-    rotations: Array
-    translations: Array
-    residuals: Array
+    frames: Floats  # (T, V, 3) aligned with the target
+    rotations: Array  # (T, 3, 3) from a frame to the target
+    translations: Array  # (T, 3); frame t is moved to ``frames[t] @ rotations[t].T + translations[t]``
+    residuals: Array  # (T,) root-mean-square distance of the stable vertices from the target that is left
 
 
 def remove_rigid_motion(

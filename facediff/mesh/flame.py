@@ -140,7 +140,7 @@ def rotations(axis_angles: Floats) -> Array:
 # out of that state, so that neither class is ever created.
 
 PACKAGES = ("chumpy", "scipy.sparse")
-SPARSE = {f"{kind}_{name}" for kind in ("csc", "csr", "coo") for name in ("matrix", "array")}
+SPARSE = {f"{kind}_{name}" for kind in ("csc", "csr") for name in ("matrix", "array")}
 DEEPEST = 16  # Objects within objects; a file could hold one that contains itself
 MOST_VERTICES = 1_000_000
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
@@ -260,21 +260,19 @@ def _reordered(name: str, state: Mapping[Any, Any], array: Values) -> Values:
 
 
 def _dense(state: Mapping[Any, Any], kind: str) -> Values:
-    """A compressed-column, compressed-row or coordinate matrix as (5, V) array."""
+    """A compressed-column or compressed-row matrix as (5, V) array."""
     # Not through scipy: it trusts the index arrays of a matrix, and these come from a file.
     rows, columns = (int(size) for size in np.asarray(state["_shape"]).ravel())
     data = np.asarray(state["data"], np.float64)
-    complete = True
-    if kind == "coo":
-        coordinates = state["coords"] if "coords" in state else (state["row"], state["col"])
-        row, column = (np.asarray(axis, np.int64) for axis in coordinates)
-    else:
-        ends = np.asarray(state["indptr"], np.int64)
-        minor = np.asarray(state["indices"], np.int64)
-        complete = ends[-1] == len(minor)
-        major = np.searchsorted(ends, np.arange(len(minor)), side="right") - 1  # of the data's size in any case
-        row, column = (minor, major) if kind == "csc" else (major, minor)
-    sound = complete and rows == JOINTS and 0 < columns <= MOST_VERTICES and len(row) == len(column) == len(data)
+    ends, minor = np.asarray(state["indptr"], np.int64), np.asarray(state["indices"], np.int64)
+    major = np.searchsorted(ends, np.arange(len(minor)), side="right") - 1  # of the data's size in any case
+    row, column = (minor, major) if kind == "csc" else (major, minor)
+    sound = (
+        ends[-1] == len(minor)
+        and rows == JOINTS
+        and 0 < columns <= MOST_VERTICES
+        and len(row) == len(column) == len(data)
+    )
     if not sound or (len(data) and min(row.min(), column.min()) < 0):
         raise ValueError(f"is a matrix of ({rows}, {columns}); expected {JOINTS} rows, and indices that match its data")
     dense = np.zeros((rows, columns))

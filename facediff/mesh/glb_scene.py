@@ -28,27 +28,16 @@ MOST_SETS = 8  # of four joints a vertex
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A primitive with triangles where a node shows it.
+    """A primitive with triangles where a node shows it."""
 
-    Attributes:
-        mesh: number of its mesh.
-        node: number of the node; -1 in a file without nodes.
-        primitive: its description in the file, which may be changed.
-        names: of the node, the mesh and the material, where they have one.
-        material: its description in the file; empty if there is none.
-        local: (V, 3) vertices as the file has them.
-        matrix: (4, 4) or (V, 4, 4) transform that places them; None if they stay.
-        faces: (F, 3) triangles, counter-clockwise seen from outside once they are placed.
-    """
-
-    mesh: int
-    node: int
-    primitive: dict[str, Any]
-    names: tuple[str, ...]
-    material: dict[str, Any]
-    local: Array
-    matrix: Array | None
-    faces: Indices
+    mesh: int  # number of its mesh
+    node: int  # number of the node; -1 in a file without nodes
+    primitive: dict[str, Any]  # its description in the file, which may be changed
+    names: tuple[str, ...]  # of the node, the mesh and the material, where they have one
+    material: dict[str, Any]  # its description in the file; empty if there is none
+    local: Array  # (V, 3) vertices as the file has them
+    matrix: Array | None  # (4, 4) or (V, 4, 4) transform that places them; None if they stay
+    faces: Indices  # (F, 3) triangles, counter-clockwise seen from outside once they are placed
 
     @property
     def turn(self) -> Array:

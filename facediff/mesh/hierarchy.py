@@ -33,28 +33,17 @@ class Operator:
 
 @dataclass(frozen=True)
 class MeshLevel:
-    """One resolution of a mesh.
-
-    Attributes:
-        n_vertices: its vertices.
-        faces: (F, 3) vertex indices.
-        spirals: (n_vertices, length) every vertex and those around it.
-        down: map to the next, coarser level; None at the coarsest.
-    """
+    """One resolution of a mesh."""
 
     n_vertices: int
-    faces: Indices
-    spirals: Indices
-    down: Operator | None
+    faces: Indices  # (F, 3)
+    spirals: Indices  # (n_vertices, length) every vertex and those around it
+    down: Operator | None  # map to the next, coarser level; None at the coarsest
 
 
 @dataclass(frozen=True)
 class MeshHierarchy:
-    """A mesh at several resolutions.
-
-    Attributes:
-        levels: finest first; one more than the number of down-samplings.
-    """
+    """A mesh at several resolutions, finest first: one more than the number of down-samplings."""
 
     levels: tuple[MeshLevel, ...]
 

@@ -14,17 +14,11 @@ from facediff.utils.numerics import Array, Floats, Integers
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    Attributes:
-        vertices: (V, 3) positions, in the order of the file.
-        faces: (F, 3) vertex indices.
-        colours: (V, 3) vertex colours, sRGB; None if the file has none.
-    """
-
-    vertices: Array
-    faces: npt.NDArray[np.int32]
-    colours: npt.NDArray[np.uint8] | None = None
+    vertices: Array  # (V, 3) positions, in the order of the file
+    faces: npt.NDArray[np.int32]  # (F, 3) vertex indices
+    colours: npt.NDArray[np.uint8] | None = None  # (V, 3) sRGB; None if the file has none
 
 
 def check_coordinates(points: Floats, source: object) -> None:

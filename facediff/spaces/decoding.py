@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from facediff.spaces.rotations import convert
 from facediff.spaces.space import Space
+from facediff.utils.numerics import Floats
 
 Array = npt.NDArray[np.float32]
 
@@ -17,12 +18,6 @@ Array = npt.NDArray[np.float32]
 @dataclass(frozen=True, eq=False)
 class ChannelDecoder:
     """From absolute channels of a speaker to vertices, head turns and weights at rest.
-
-    Attributes:
-        space: of the channels.
-        resting: (C,) their values at rest.
-        neutral: (V, 3) the face at rest.
-        deltas: (K, V, 3) displacements of the vertices at 1 of each channel of :attr:`Space.face`.
 
     Example:
         >>> space = Space("linear", ("jawOpen",))
@@ -32,11 +27,11 @@ class ChannelDecoder:
     """
 
     space: Space
-    resting: npt.NDArray[np.floating]
-    neutral: npt.NDArray[np.floating]
-    deltas: npt.NDArray[np.floating]
+    resting: Floats  # (C,) values of the channels at rest
+    neutral: Floats  # (V, 3) the face at rest
+    deltas: Floats  # (K, V, 3) displacements of the vertices at 1 of each channel of :attr:`Space.face`
 
-    def vertices(self, points: npt.NDArray[np.floating]) -> Array:
+    def vertices(self, points: Floats) -> Array:
         """Absolute vertices (T, V, 3) of absolute channels (T, C, 1); the head as a whole stays where it is."""
         weights = (points[..., 0] - self.resting)[:, list(self.space.face)].astype(np.float32)
         moved = weights @ np.asarray(self.deltas, np.float32).reshape(len(self.deltas), -1)
@@ -45,11 +40,11 @@ class ChannelDecoder:
         return moved
 
     @staticmethod
-    def values(points: npt.NDArray[np.floating]) -> Array:
+    def values(points: Floats) -> Array:
         """Channels (T, C) as animations keep them."""
         return np.ascontiguousarray(points[..., 0], np.float32)
 
-    def head_turns(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64] | None:
+    def head_turns(self, points: Floats) -> npt.NDArray[np.float64] | None:
         """How the head turns as a whole (T, 3), axis-angle in radians; None where no channel says it."""
         turn = next((turn for turn in self.space.rotations if turn.joint == "head"), None)
         return None if turn is None else convert(points[:, list(turn.channels), 0], turn.form, "axis_angle")

@@ -27,25 +27,16 @@ AXES = {
 
 @dataclass(frozen=True)
 class Layout:
-    """A layout.
+    """The columns of files of a program or a corpus."""
 
-    Attributes:
-        space: of the columns of the motion.
-        frame_rate: frames a second where the layout has one rate only.
-        identity: leading columns of a flat array that are the person's and not motion.
-        arrays: of an archive, each array's name and the columns of it that are motion, in the space's order.
-        identity_array: name of the array of an archive that has the person's coefficients.
-        source: the programs or corpora that use it.
-        flat: whether it occurs as one array too; else as an archive only.
-    """
-
-    space: Space
-    frame_rate: float | None = None
-    identity: int = 0
+    space: Space  # of the columns of the motion
+    frame_rate: float | None = None  # frames a second where the layout has one rate only
+    identity: int = 0  # leading columns of a flat array that are the person's and not motion
+    # Of an archive, each array's name and the columns of it that are motion, in the space's order
     arrays: Mapping[str, slice] | None = None
-    identity_array: str = ""
-    source: str = ""
-    flat: bool = True
+    identity_array: str = ""  # name of the array of an archive that has the person's coefficients
+    source: str = ""  # the programs or corpora that use it
+    flat: bool = True  # whether it occurs as one array too; else as an archive only
 
     @property
     def width(self) -> int:

@@ -25,26 +25,18 @@ Values = Floats
 class LinearRig:
     """A linear face model: a neutral face plus a weighted sum of displacements.
 
-    Attributes:
-        names: C channels; ARKit's own spelling where they are ARKit's.
-        neutral: (V, 3) the face at rest.
-        deltas: (C, V, 3) displacements of the vertices at weight 1.
-        faces: (F, 3) triangles; None if there are none.
-        unit: of length; empty if the file does not say.
-        title: its name in messages and records.
-
     Example:
         >>> rig = LinearRig(("jawOpen",), np.zeros((2, 3)), np.ones((1, 2, 3)))
         >>> rig.decode(np.array([[0.5]]))[0, 0], rig.gram()
         (array([0.5, 0.5, 0.5]), array([[6.]]))
     """
 
-    names: tuple[str, ...]
-    neutral: Array
-    deltas: Array
-    faces: Integers | None = None
-    unit: str = "m"
-    title: str = ""
+    names: tuple[str, ...]  # C channels; ARKit's own spelling where they are ARKit's
+    neutral: Array  # (V, 3) the face at rest
+    deltas: Array  # (C, V, 3) displacements of the vertices at weight 1
+    faces: Integers | None = None  # (F, 3) triangles
+    unit: str = "m"  # of length; empty if the file does not say
+    title: str = ""  # in messages and records
 
     @classmethod
     def read(cls, path: Path) -> LinearRig:

@@ -6,6 +6,7 @@ coordinates; for parameters the points are channels, one number each. Units of l
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import asdict, dataclass, fields
@@ -36,11 +37,8 @@ REGIONS: dict[str, tuple[str, ...]] = {
 class Rotation:
     """A run of channels that together are one rotation, in radians.
 
-    Attributes:
-        joint: the joint that turns.
-        start: the first channel.
-        form: how it is written: ``axis_angle`` (3 channels), its x alone (1), the first two columns of the matrix
-            (``six_d``, 6), ``quaternion`` (4), or ``euler`` angles (3).
+    Forms are ``axis_angle`` (3 channels), its x alone (1), the first two columns of the matrix (``six_d``, 6),
+    ``quaternion`` (4), and ``euler`` angles (3).
     """
 
     joint: Joint
@@ -167,7 +165,8 @@ class Space:
 
     def state(self) -> dict[str, Any]:
         """The record as plain containers, fit for checkpoints and JSON."""
-        return {name: _plain(value) for name, value in asdict(self).items()}
+        record: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return record
 
     @classmethod
     def from_state(cls, state: object) -> Space:
@@ -183,10 +182,6 @@ class Space:
 
 VERTICES = Space()
 """The space of a mesh's vertices."""
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401 - a field of the record
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}

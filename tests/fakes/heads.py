@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 
 from facediff.animation import Animation
+from facediff.editing.landmarks import Landmarks
 from facediff.synthetic.head.parts import EYE_CENTRE, build_head
 from facediff.synthetic.head.people import Face
 from facediff.synthetic.head.rig import head_shapes
@@ -32,6 +33,13 @@ class Head:
     faces: np.ndarray  # (F, 3)
     parts: dict[str, np.ndarray] = field(default_factory=dict)  # faces of named parts, in the order of the mesh
     alive: bool = True  # whether lips can part at all
+
+
+def nearest_vertices(landmarks: Landmarks) -> list[list[int]]:
+    """The vertices of both meshes that weigh most in each place."""
+    every = np.arange(len(landmarks))
+    sides = [side.corners[every, side.weights.argmax(axis=1)] for side in (landmarks.source, landmarks.target)]
+    return np.stack(sides, axis=1).tolist()  # type: ignore[no-any-return]
 
 
 def talking(shape: Shape | None = None) -> Animation:

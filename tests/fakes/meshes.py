@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 
@@ -20,6 +22,12 @@ def sphere(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     foot = np.stack([np.full(columns, top + 1), last + (around + 1) % columns, last + around], 1)
     faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1), cap, foot])
     return np.concatenate([ring, [[0, 0, 1], [0, 0, -1]]]), faces
+
+
+def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a mesh in text."""
+    lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    path.write_text("\n".join(lines) + "\n")
 
 
 def relief(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
+from facediff.animation.options import AnimationControls
+from facediff.cli.parsing import parameters_of, parse
+from facediff.editing.controls import check_controls
 from facediff.editing.controls.expressiveness import scaled_regions
 from facediff.editing.controls.eyelids import Eyes
 from facediff.editing.controls.procedural import (
@@ -26,6 +29,17 @@ from facediff.editing.controls.procedural import (
     turn_eyes,
     with_metadata,
 )
+
+
+def parsed(*words: str) -> AnimationControls:
+    """The controls that the words of a command line ask for."""
+    controls: AnimationControls = parse(parameters_of(with_controls), words, "animate")["controls"]
+    check_controls(controls)
+    return controls
+
+
+def with_controls(*, controls: AnimationControls) -> None:
+    """A command that has the controls only."""
 
 
 def add_blinks(animation: Animation, eyes: Eyes, *, rate: Amount = RATE, seed: int = 0) -> Animation:

@@ -173,15 +173,6 @@ def test_sparse_matrices_of_any_release_and_protocol(module: str, protocol: int,
     np.testing.assert_array_equal(read_flame_arrays(tmp_path / "m.pkl").joint_regressor, dense)
 
 
-def test_coordinate_matrices(tmp_path: Path) -> None:
-    dense = flame_arrays()["J_regressor"]
-    row, column = np.nonzero(dense)
-    places = {"_shape": dense.shape, "data": dense[row, column], "row": row, "col": column}
-    content = {**flame_arrays(), "J_regressor": foreign("scipy.sparse.coo", "coo_matrix", places)}
-    (tmp_path / "m.pkl").write_bytes(model_pickle(content))
-    np.testing.assert_array_equal(read_flame_arrays(tmp_path / "m.pkl").joint_regressor, dense)
-
-
 def test_chumpy_objects_that_reorder(tmp_path: Path) -> None:
     """A selection of the columns of a longer basis, reshaped; weights that were turned round."""
     content = flame_arrays()

@@ -139,17 +139,9 @@ def _clip(
 
 
 def _remarks(values: npt.NDArray[np.float32], entry: Layout) -> tuple[str, ...]:
-    """The community's mix-ups, with the evidence for them; nothing is changed."""
+    """The community's mix-up, with the evidence for it; nothing is changed."""
     notes = []
-    space = entry.space
-    families = [index for index, name in enumerate(space.channels) if name.startswith("expression_")]
-    beyond = [index for index in families if int(space.channels[index].rpartition("_")[2]) >= 50]
-    if beyond and not np.any(values[:, beyond]) and np.any(values[:, families]):
-        notes.append(
-            f"expressions 50 to {len(families) - 1} are 0 in all frames: the fit probably had 50 coefficients of the "
-            f"{len(families)} that the layout has"
-        )
-    turns = {turn.joint: turn for turn in space.rotations if turn.form == "axis_angle"}
+    turns = {turn.joint: turn for turn in entry.space.rotations if turn.form == "axis_angle"}
     if {"head", "jaw"} <= set(turns):
         head, jaw = (values[:, list(turns[joint].channels)] for joint in ("head", "jaw"))
         # A jaw opens about x, in one direction, and hardly turns about y and z; a head turns about all three.

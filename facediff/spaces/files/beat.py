@@ -74,14 +74,8 @@ def _times(path: Path, frames: list[Any]) -> np.ndarray[Any, np.dtype[np.float64
     return times
 
 
-def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> None:
-    """Write a clip as BEAT does.
-
-    Args:
-        path: the file.
-        clip: in a space of ARKit's; its order is kept.
-        metadata: add frame rate and number of frames, as LAM does.
-    """
+def write_beat(path: Path, clip: ParameterClip) -> None:
+    """Write a clip in a space of ARKit's as BEAT does, in the clip's order."""
     turning = {*clip.space.head, *clip.space.eyes}
     shapes = [
         index
@@ -95,6 +89,6 @@ def write_beat(path: Path, clip: ParameterClip, *, metadata: bool = False) -> No
         for row, time in zip(clip.values, times, strict=True)
     ]
     content: dict[str, Any] = {"names": [clip.space.channels[index] for index in shapes], "frames": frames}
-    if metadata or len(frames) < 2:  # of one frame, times do not say the rate
+    if len(frames) < 2:  # of one frame, times do not say the rate
         content = {"metadata": {"fps": clip.frame_rate, "frame_count": len(frames)}, **content}
     write_json(path, content)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,29 +27,17 @@ LARGEST = 1e6
 
 @dataclass(frozen=True, eq=False)
 class ParameterClip:
-    """Values of a recording and their space.
-
-    Attributes:
-        name: of the recording.
-        values: (T, C) as the file has them: weights above 1 and below 0 are kept.
-        space: their space.
-        frame_rate: frames a second.
-        times: (T,) seconds from the first row on, for files that state them; None where rows follow evenly.
-        start: seconds since midnight of the first row, by its timecode.
-        identity: (S,) the person's coefficients, where the file has them.
-        layout: name of the layout that the file is in.
-        notes: what readers found that users should know, a sentence each.
-    """
+    """Values of a recording and their space."""
 
     name: str
-    values: Values
+    values: Values  # (T, C) as the file has them: weights above 1 and below 0 are kept
     space: Space
     frame_rate: float
-    times: Array | None = None
-    start: float = 0.0
-    identity: Values | None = None
-    layout: str = ""
-    notes: tuple[str, ...] = field(default=())
+    times: Array | None = None  # (T,) seconds from the first row on, as files state them; None where rows follow evenly
+    start: float = 0.0  # seconds since midnight of the first row, by its timecode
+    identity: Values | None = None  # (S,) the person's coefficients, where the file has them
+    layout: str = ""  # name of the layout that the file is in
+    notes: tuple[str, ...] = ()  # findings of the reader, a sentence each
 
     @property
     def dropped(self) -> int:

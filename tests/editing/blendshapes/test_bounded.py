@@ -14,7 +14,6 @@ from facediff.editing.bounded import least_squares
 from facediff.editing.shapes import ShapeSet, check_shapes, read_shapes
 from facediff.errors import FaceDiffError
 from facediff.synthetic.known_faces import built_in_shapes
-from tests.fakes.small_face import small_shapes
 
 RNG = np.random.default_rng(3)
 NEUTRAL = RNG.normal(0, 0.08, (60, 3))
@@ -50,20 +49,6 @@ def test_shapes_that_cancel_one_another_rest() -> None:
     assert (np.minimum(found[resting, 0], found[resting, 1]) > 0.01).mean() < 0.1
     assert np.abs(found[resting, :2]).mean() < 0.5 * np.abs(standing[resting, :2]).mean()
     assert found[:, 2] == pytest.approx(goal[:, 2], abs=0.05)
-
-
-def test_weights_that_are_known_come_back_nearer_than_with_a_strong_sparsity() -> None:
-    rest, _, shapes = small_shapes()
-    names = tuple(name for name in shapes if name != "tongueOut")
-    known = ShapeSet(names, rest, np.stack([shapes[name] - rest for name in names]))
-    waves = np.sin(np.linspace(0, 6, 20)[:, None] * RNG.uniform(0.3, 2, len(names)) + RNG.uniform(0, 6, len(names)))
-    truth = np.clip(1.5 * waves - 0.7, 0, 1)
-    moved = Animation("a", rest + np.einsum("tk,kvc->tvc", truth, known.deltas), rest, 30.0)
-    usual, strong = (
-        np.sqrt(np.square(solve(moved, known, options).values - truth).mean())
-        for options in (SolveOptions(smoothness=0), SolveOptions(smoothness=0, sparsity=0.02))
-    )
-    assert usual < strong
 
 
 def test_what_is_at_work_keeps_its_size() -> None:

@@ -125,13 +125,9 @@ def test_a_shape_that_gains_too_little_stays_at_zero_and_fades_as_offline() -> N
     assert (first[4:] == 0).all()
 
 
-def test_shapes_without_effect_keep_weight_zero_and_what_is_left_is_measured() -> None:
+def test_shapes_without_effect_keep_weight_zero() -> None:
     shapes = some_shapes(3)
     shapes = replace(shapes, deltas=np.concatenate([shapes.deltas[:2], np.zeros_like(shapes.deltas[:1])]))
-    solver = FrameSolver(shapes, 30.0, unit="cm", options=NO_PRIOR)
+    solver = FrameSolver(shapes, 30.0, options=NO_PRIOR)
     weights = solver.solve(shapes.deltas[0] + 0.0)
     assert weights[2] == 0
-    assert solver.residual_mm(shapes.deltas[0], weights) == pytest.approx(0, abs=1e-6)
-    away = np.zeros_like(shapes.deltas[0])
-    away[:, 0] = 3.0
-    assert solver.residual_mm(away, np.zeros(3)) == pytest.approx(30.0)

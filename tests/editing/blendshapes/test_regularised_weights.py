@@ -67,23 +67,3 @@ def test_solve_is_the_published_system(term: TemporalTerm) -> None:
     np.testing.assert_allclose(weights, reference(term), atol=1e-9)
     assert ((weights[:, 2] <= 1e-10) | (weights[:, 3] <= 1e-10)).all()
     assert np.isclose(weights[:, :1], 0).any() or np.isclose(weights[:, :1], 1).any()
-
-
-def test_the_corrected_temporal_term_keeps_the_size_of_the_motion() -> None:
-    true = np.linspace(0.3, 0.7, 60)[:, None] * np.array([1, 0.5, 0.8, 0.2, 0.6, 0.4, 0.9, 0.5])
-    motion = NEUTRAL + np.tensordot(true, DELTAS, 1)
-    means = {}
-    for term in ("published", "corrected"):
-        options = Regularisation(l1=0, l2=0, symmetry=0, temporal=0.2, template_size=40.0, temporal_term=term)  # type: ignore[arg-type]
-        means[term] = RegularisedSolver(NEUTRAL, DELTAS, regularisation=options).solve(motion)[5:].mean()
-    assert means["corrected"] == pytest.approx(true[5:].mean(), rel=0.05)
-    assert means["published"] < 0.8 * true.mean()
-
-
-def test_solve_recovers_weights_where_nothing_is_regularised() -> None:
-    weights = np.random.default_rng(5).random((6, 8))
-    options = Regularisation(l1=0, l2=0, symmetry=0)
-    solved = RegularisedSolver(NEUTRAL, DELTAS, regularisation=options).solve(
-        NEUTRAL + np.tensordot(weights, DELTAS, 1)
-    )
-    np.testing.assert_allclose(solved, weights, atol=1e-9)

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from facediff.editing.blendshapes import Weights, live_link_values, write_live_link, write_weights
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import read_parameters
-from facediff.spaces.files.csv_files import timecode
 
 
 @pytest.fixture
@@ -90,18 +89,6 @@ def test_a_plain_table(tmp_path: Path, weights: Weights) -> None:
     assert table["mine"] == pytest.approx(weights.values[:, 1], abs=1e-8)
     assert table["residual_max_mm"] == pytest.approx(weights.residual_max_mm, abs=1e-6)
     assert json.loads((tmp_path / "a.json").read_text())["not_in_table"] == []
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (60 * 61 + 61 + 24 / 25, "01:02:01:57.600"),
-        (1 - 1e-7, "00:00:01:00.000"),
-        (24 * 3600 + 1, "00:00:01:00.000"),
-    ],
-)
-def test_timecodes(seconds: float, text: str) -> None:
-    assert timecode(seconds) == text
 
 
 def read_like_unreal(path: Path, *, infers: bool) -> tuple[list[float], list[dict[str, str]]]:

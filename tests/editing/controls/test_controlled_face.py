@@ -13,25 +13,12 @@ import pytest
 
 from facediff.animation import Animation
 from facediff.animation.options import AnimationControls
-from facediff.cli.parsing import parameters_of, parse
-from facediff.editing.controls import check_controls
 from facediff.editing.controls.controlled_face import apply_controls
 from facediff.editing.controls.direction import MOODS, Direction, Key, read_direction
 from facediff.editing.controls.eyelids import Eyes
 from facediff.errors import FaceDiffError
 from facediff.synthetic.known_faces import built_in_rig
-from tests.fakes.single_controls import add_blinks, add_gaze, add_sway, scale_regions
-
-
-def parsed(*words: str) -> AnimationControls:
-    """The controls that the words of a command line ask for."""
-    controls: AnimationControls = parse(parameters_of(with_controls), words, "animate")["controls"]
-    check_controls(controls)
-    return controls
-
-
-def with_controls(*, controls: AnimationControls) -> None:
-    """A command that has the controls only."""
+from tests.fakes.single_controls import add_blinks, add_gaze, add_sway, parsed, scale_regions
 
 
 def test_editing_is_imported_only_where_it_is_asked_for() -> None:

@@ -12,24 +12,12 @@ import numpy as np
 import pytest
 
 from facediff.animation import Animation
-from facediff.animation.options import AnimationControls
-from facediff.cli.parsing import parameters_of, parse
-from facediff.editing.controls import check_controls
 from facediff.editing.controls.controlled_face import apply_controls
 from facediff.editing.controls.eyelids import Eyes, puppet_eyes, read_eyes
 from facediff.errors import FaceDiffError
 from facediff.synthetic.head.parts import build_head
-
-
-def parsed(*words: str) -> AnimationControls:
-    """The controls that the words of a command line ask for."""
-    controls: AnimationControls = parse(parameters_of(with_controls), words, "animate")["controls"]
-    check_controls(controls)
-    return controls
-
-
-def with_controls(*, controls: AnimationControls) -> None:
-    """A command that has the controls only."""
+from tests.fakes.meshes import write_obj
+from tests.fakes.single_controls import parsed
 
 
 def test_the_puppets_own_eyes(make_animation: Callable[..., Animation], eyes: Eyes) -> None:
@@ -64,11 +52,6 @@ def test_lids_of_other_speakers_on_the_puppets_mesh_shut_by_their_edges(
     assert not found.closing[animation.regions["lips"]].any()
     mirror = build_head().mirror
     np.testing.assert_allclose(found.closing[mirror] * [-1, 1, 1], found.closing, atol=2e-4)
-
-
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    lines = [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices]
-    path.write_text("\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces)]) + "\n")
 
 
 @pytest.fixture

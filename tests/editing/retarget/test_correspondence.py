@@ -12,6 +12,7 @@ from facediff.editing.correspondence import Correspondence, correspond, refuse_o
 from facediff.editing.landmarks import read_landmarks
 from facediff.editing.retargeting import load_correspondence, save_correspondence
 from facediff.errors import FaceDiffError
+from tests.fakes.heads import nearest_vertices
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def test_what_is_saved_comes_back(found: Correspondence, tmp_path: Path) -> None
 @pytest.mark.parametrize("text", ["1,2\n3,4\n", "source,target\n1,2\n\n3, 4\n", "\ufeff1,2\r\n3,4\r\n"])
 def test_landmarks(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.csv").write_text(text, encoding="utf-8")
-    assert read_landmarks(tmp_path / "a.csv").nearest_vertices.tolist() == [[1, 2], [3, 4]]
+    assert nearest_vertices(read_landmarks(tmp_path / "a.csv")) == [[1, 2], [3, 4]]
 
 
 def test_a_correspondence_of_another_face_is_refused_and_a_sculpted_one_kept() -> None:

@@ -147,6 +147,7 @@ def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
     assert seen is not None
     alone = [np.arange(8) + first for name, first in begins.items() if name != "skin"]
     detached = detached_parts(Surface(vertices, faces), whole, features, seen, alone)
+    followers, corners, weights = detached.followers
     kinds = {
         name: "jaw" if first in detached.jaw else "still" if first in detached.still else "skin"
         for name, first in begins.items()
@@ -156,17 +157,12 @@ def test_pieces_of_a_head_are_told_by_their_place(animation: Animation) -> None:
     }  # fmt: skip
     assert {name for name, kind in kinds.items() if kind == "skin"} == {"skin", "moustache", "beard", "brow", "lash"}
     # What lies on the skin moves with it, and lashes with the edge of their lid.
-    assert {name for name, first in begins.items() if first in detached.followers} == {
-        "moustache",
-        "beard",
-        "brow",
-        "lash",
-    }
-    lash = np.isin(detached.followers, begins["lash"] + np.arange(8))
-    assert np.isin(detached.follower_corners[lash], eye.upper_seeds).all()
-    assert detached.follower_weights.sum(axis=1) == pytest.approx(1)
+    assert {name for name, first in begins.items() if first in followers} == {"moustache", "beard", "brow", "lash"}
+    lash = np.isin(followers, begins["lash"] + np.arange(8))
+    assert np.isin(corners[lash], eye.upper_seeds).all()
+    assert weights.sum(axis=1) == pytest.approx(1)
     # Lashes that are one strip bend with the edge.
-    assert len(np.unique(detached.follower_corners[lash], axis=0)) > 1
+    assert len(np.unique(corners[lash], axis=0)) > 1
 
 
 @pytest.mark.parametrize("second_edition", [True, pytest.param(False, marks=pytest.mark.slow)])

@@ -15,6 +15,7 @@ from facediff.editing.retargeting import retarget
 from facediff.mesh.glb import open_glb
 from facediff.render import Look
 from tests.fakes.glb_targets import File
+from tests.fakes.meshes import write_obj
 
 TARGET = ("--target-mesh", "face.obj")
 
@@ -31,11 +32,6 @@ def animation(tmp_path: Path) -> Animation:
     )
     write_archive(tmp_path / "take.npz", animation)
     return animation
-
-
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
-    path.write_text("\n".join(lines) + "\n")
 
 
 @pytest.fixture

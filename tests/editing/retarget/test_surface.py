@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from facediff.editing.correspondence import averaging, edges_of, part_pairs, pieces, smooth_field
-from facediff.editing.surface import Surface, nearest, vertex_normals
+from facediff.editing.correspondence import averaging, part_pairs, pieces, smooth_field
+from facediff.editing.surface import Surface, edges_of, nearest, vertex_normals
 
 RNG = np.random.default_rng(0)
 

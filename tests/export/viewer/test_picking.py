@@ -25,7 +25,7 @@ from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, pickin
 from facediff.mesh import Mesh
 from facediff.utils.server import LOOPBACK, names_of
 from tests.fakes.chromium import Chromium, Page
-from tests.fakes.heads import LONG, talking
+from tests.fakes.heads import LONG, nearest_vertices, talking
 from tests.fakes.serving import servers
 from tests.fakes.small_face import LANDMARKS, build_face, build_rig
 
@@ -100,7 +100,7 @@ def test_what_the_page_sends_is_saved_and_ends_the_server(serve: Serve, picking:
     status, answer = ask(f"{address}/api/landmarks", pairs(), Origin=address)
     assert (status, json.loads(answer)) == (200, {"saved": 4, "file": "map.landmarks.json"})
     found = read_landmarks(picking.file)
-    assert found.nearest_vertices.tolist() == [[MARKS[name], own(name)] for name in list(NAMES)[:4]]
+    assert nearest_vertices(found) == [[MARKS[name], own(name)] for name in list(NAMES)[:4]]
     with pytest.raises(OSError, match="refused|reset|closed"):
         ask_until_it_ends(f"{address}/")
 

@@ -70,13 +70,6 @@ def test_head_and_jaw_that_may_be_exchanged_are_reported_and_kept(tmp_path: Path
     assert any("exchanged" in note for note in clip.notes) == exchanged
 
 
-def test_fifty_coefficients_in_a_hundred_are_reported(tmp_path: Path) -> None:
-    values = RNG.normal(size=(20, 103)).astype(np.float32)
-    values[:, 50:100] = 0
-    np.save(tmp_path / "a.npy", values)
-    assert any("50 to 99" in note for note in read_parameters(tmp_path / "a.npy", layout="flame_emote").notes)
-
-
 def test_a_person_that_changes_and_nan_are_refused(tmp_path: Path) -> None:
     values = RNG.normal(size=(20, 413)).astype(np.float32)
     np.save(tmp_path / "a.npy", values[None])
