@@ -121,10 +121,6 @@ class FaceDiffError(Exception):
         """The same error with the place it comes from, such as a file and its line, in front of the message."""
         return FaceDiffError(f"{location}: {self}")
 
-    def followed_by(self, hint: str) -> FaceDiffError:
-        """The same error with a hint after it; options in the hint stand in braces."""
-        return OptionError.naming(f"{self}{hint}")
-
 
 _OPTION_NAME = re.compile(r"\{([a-z]+(?:_[a-z]+)*)\}")
 
@@ -173,10 +169,6 @@ class OptionError(FaceDiffError):
     def within(self, location: object) -> OptionError:
         """The same error with the place it comes from in front of the message."""
         return OptionError(self._in_front, self.problem, self.value, location=f"{location}: {self.place}")
-
-    def followed_by(self, hint: str) -> OptionError:
-        """The same error with a hint after it; options in it stand in braces."""
-        return OptionError(self._in_front, self.problem + hint, self.value, location=self.place)
 
     def _sentence(self, spelled: Callable[[str], str]) -> str:
         value = "" if self.value is None else f" {self.value}"

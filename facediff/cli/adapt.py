@@ -172,7 +172,7 @@ def train_on(
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
     from facediff.cli.lightning import exit_statuses
-    from facediff.cli.trainer_options import IDLE_WARNINGS, without_warnings
+    from facediff.cli.lightning_cli import IDLE_WARNINGS, without_warnings
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
     from facediff.models.checkpoint import read_checkpoint
     from facediff.models.checkpoint_content import IMPORTED

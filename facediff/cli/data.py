@@ -197,26 +197,13 @@ def describe(report: PreparationReport) -> list[str]:
     ]
     for title, entries in (("missing", report.missing), ("failed", report.failed)):
         if entries:
-            indented = [f"  {line}" for line in grouped(entries)]
+            indented = [f"  {key}: {text}" for key, text in entries.items()]
             lines += [f"{title}: {len(entries)}", *shortened(indented, f"  … and {{}} more, see {manifest}")]
     notes = [f"note: {note}" for note in report.notes]
     return [
         *lines,
         *shortened(notes, f"note: … and {{}} more, see {manifest}"),
         f"Next: facediff data check {report.out}",
-    ]
-
-
-def grouped(entries: dict[str, str]) -> list[str]:
-    """A line for each entry, but one line for clips of a subject with texts that differ in the clip's name only."""
-    groups: dict[tuple[str, str], list[str]] = {}
-    for key, text in entries.items():
-        subject, _, sentence = key.rpartition("_")
-        common = text.replace(key, "").replace(sentence, "") if subject else text
-        groups.setdefault((subject or key, common), []).append(key)
-    return [
-        f"{keys[0]}{f' … {keys[-1]} ({len(keys)} in all)' if len(keys) > 1 else ''}: {entries[keys[0]]}"
-        for keys in groups.values()
     ]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,10 +19,6 @@ if TYPE_CHECKING:
 
 
 CONFIG = "configs/experiment/puppet.yaml"
-COMPARED = 16
-"""Clips of each test split on which the new model is compared with the bundled one."""
-SHOWN = {"closure_auc": "closures (AUC)", "open_vowels": "open vowels", "rounding": "rounding"}
-"""Scores of articulation that are printed."""
 SHEET = 12
 """Frames on a contact sheet."""
 FAST = ("--data.drawn_speakers=0", "--trainer.max_epochs=8", "--model.warmup_steps=20")
@@ -40,9 +35,8 @@ def demo(
     """Make a corpus, train a model on it, test it and render a talking face.
 
     Makes the built-in synthetic corpus, trains the small dual-path model on it, distils its audio encoder for
-    other voices and rooms, scores it on sentences that were not in training, writes videos of truth next to
-    prediction, and compares it with the model that comes with facediff. About ten minutes on two CPU cores.
-    The same command continues a training that was stopped.
+    other voices and rooms, scores it on sentences that were not in training, and writes videos of truth next to
+    prediction. About ten minutes on two CPU cores. The same command continues a training that was stopped.
 
     Args:
         output: folder for all results
@@ -86,12 +80,9 @@ def demo(
     tested = run_cli("test", ["--ckpt_path", str(checkpoint), *where])
     report("rendering truth next to prediction")
     videos = write_videos(output, tested.model, tested.datamodule)
-    report("comparing it with the model that comes with facediff")
-    compared = compare_with_bundled(checkpoint, tested.datamodule)
     tell("", f"facediff demo: done in {time.monotonic() - started:.0f} s. Results:")
     for path in (*videos, output / "test_scores.csv", checkpoint):
         tell(f"  {path}")
-    tell(*compared)
     tell(f"Next: facediff animate speech.wav --checkpoint {checkpoint} --identity F1 -o speech.mp4")
 
 
@@ -135,60 +126,3 @@ def write_sheet(path: Path, animations: Sequence[Animation], footer: str = "") -
     frames = drawn_frames(few, ExportOptions(footer=footer, size=224))
     times = [f"{pick / animations[0].frame_rate:.2f} s" for pick in picks]
     save_image(path, contact_sheet(list(frames), 4, labels=times))
-
-
-def compare_with_bundled(checkpoint: Path, data: SpeechMotionDataModule) -> list[str]:
-    """Lips of ``facediff animate`` with the new and the bundled model, in a line a test split.
-
-    Lip vertex errors are shares of a still face's, over the same clips, and articulation of the truth's; both models
-    choose the style by themselves.
-    """
-    import torch
-
-    import facediff
-    from facediff.data.articulation import MouthMotion, articulation, mouth_motion
-    from facediff.metrics import lip_vertex_error
-    from facediff.speech.phonemes import phonemes_file, read_phonemes
-    from facediff.utils.hub import BUNDLED, is_exported
-
-    assets = data.assets()
-    lips, pairs = assets.regions["lips"], assets.inner_lip_pairs
-    if pairs is None or not is_exported(BUNDLED):
-        return []
-    models = [facediff.load(checkpoint), facediff.load(BUNDLED)]
-    lines = []
-    for split in data.test_splits:
-        dataset = data.dataset(split)
-        count = min(COMPARED, len(dataset))
-        errors, mouths = list[list[float]](), list[list[MouthMotion]]()
-        for i in range(count):
-            sample = dataset[i * len(dataset) // count]
-            file = phonemes_file(data.root, sample.name)
-            truth = sample.motion + sample.template
-            # A seed for each clip: samples that share their noise err in the same direction.
-            animations = [
-                model.animate(sample.audio, 16_000, identity=sample.identity_name, seed=i) for model in models
-            ]
-            motions = [
-                *(torch.from_numpy(animation.vertices) for animation in animations),
-                sample.template.expand_as(truth),
-            ]
-            errors.append([lip_vertex_error(motion, truth, lips).item() for motion in motions])
-            measured = partial(
-                mouth_motion,
-                template=sample.template.numpy(),
-                lip_pairs=pairs.numpy(),
-                millimetres=1000,
-                frame_rate=data.frame_rate,
-                phonemes=[] if file is None else read_phonemes(file),
-            )
-            mouths.append([*(measured(animation.vertices) for animation in animations), measured(truth.numpy())])
-        trained, bundled, still = (sum(column) for column in zip(*errors, strict=True))
-        *made, true = (articulation(column) for column in zip(*mouths, strict=True))
-        shares = [each.shares_of(true) for each in made]
-        lines.append(
-            f"{split}, lip error of animate over a still face's: this model {trained / still:.2f}, "
-            f"the one that comes with facediff {bundled / still:.2f}; over the truth's: "
-            + ", ".join(f"{words} {shares[0][name]:.2f}, {shares[1][name]:.2f}" for name, words in SHOWN.items())
-        )
-    return lines

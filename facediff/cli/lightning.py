@@ -15,14 +15,23 @@ import re
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from facediff import registry
-from facediff.cli.configs import as_parts, bundled_config, check_config, class_of, keys_of, name_of
+from facediff.cli.configs import (
+    as_parts,
+    bundled_config,
+    change_values,
+    check_config,
+    class_of,
+    keys_of,
+    name_of,
+    refuse_early,
+    value_of,
+)
 from facediff.cli.process import StoppedBySignal, tell
-from facediff.cli.words import change_values, refuse_early, value_of
 from facediff.errors import FaceDiffError, import_failure
 from facediff.hyperparameters import plain
 from facediff.utils.files import config_dir
@@ -111,18 +120,17 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
         return run_lightning_cli(name, options, experiment_name(options) or name)
 
 
-def keep_freed_memory() -> bool:
-    """Have glibc reuse the memory of freed tensors; returns whether it could be told.
+def keep_freed_memory() -> None:
+    """Have glibc reuse the memory of freed tensors.
 
     By default it returns large blocks to the system, which hands them out again page by page: at 6 000 vertices a
     quarter of a training step on a processor (0.24 of 0.91 processor seconds).
     """
     mmap_max, trim_threshold = -4, -1  # of malloc.h
-    try:
+    with suppress(OSError, AttributeError):  # another system, or another C library
         tell_malloc = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):  # another system, or another C library
-        return False
-    return bool(tell_malloc(mmap_max, 0) and tell_malloc(trim_threshold, 2**31 - 1))
+        tell_malloc(mmap_max, 0)
+        tell_malloc(trim_threshold, 2**31 - 1)
 
 
 def parse_fit(arguments: Sequence[str]) -> tuple[Parsed, Parsed]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import os
 import pickle
 import re
-import shutil
 import signal
 import sys
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -19,11 +16,10 @@ import pytest
 import soundfile
 import torch
 
-from facediff.animation import Animation, read_archive
+from facediff.animation import read_archive
 from facediff.cli.app import main
 from facediff.mesh import read_mesh
 from facediff.models import DualPathDiffusion, load_model
-from facediff.pipelines.animate import AnimationPipeline
 from facediff.speech.audio import read_speech
 from tests.fakes.processes import Forked, program
 from tests.fakes.waiting import wait_until, wait_until_read
@@ -54,22 +50,6 @@ def test_npy_holds_absolute_vertices_and_repeats_bit_for_bit(speech: Path, check
     assert np.abs(first - template).max() < 0.2
 
 
-def test_a_model_without_styles_is_told_of(
-    speech: Path, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Exported models of SelfTalk, LAM or EmoTalk take no style."""
-    write = AnimationPipeline.write
-
-    def without(self: AnimationPipeline, *arguments: Any, **options: Any) -> tuple[list[Path], Animation]:  # noqa: ANN401
-        written, made = write(self, *arguments, **options)
-        facts = {name: value for name, value in made.metadata.items() if name not in ("style", "identity")}
-        return written, replace(made, metadata=facts)
-
-    monkeypatch.setattr(AnimationPipeline, "write", without)
-    assert main(["animate", str(speech), "--checkpoint", str(checkpoint), "-o", str(tmp_path / "a.npy")]) == 0
-    assert "25 frames, licence: " in capsys.readouterr().out
-
-
 def test_the_recording_in_the_package_needs_no_other_file(
     speech: Path, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,33 +60,26 @@ def test_the_recording_in_the_package_needs_no_other_file(
     assert "has no effect" in capsys.readouterr().err
 
 
-def test_mp4_has_every_frame_and_the_speech(speech: Path, checkpoint: Path, tmp_path: Path) -> None:
-    path = tmp_path / "out.mp4"
-    assert animate(speech, "--checkpoint", checkpoint, "-o", path, "--size", 64) == 0
-    with av.open(str(path)) as video:
-        assert sum(1 for _ in video.decode(video=0)) == 25
-    with av.open(str(path)) as video:
-        sound = np.concatenate([frame.to_ndarray().ravel() for frame in video.decode(audio=0)])
-    assert np.abs(sound).max() > 0.1
-
-
-def test_sampler_steps_and_style_are_chosen(speech: Path, checkpoint: Path, tiny_root: Path, tmp_path: Path) -> None:
-    def made(*words: object) -> np.ndarray:
-        assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "x.npy", *words) == 0
-        return np.load(tmp_path / "x.npy")
-
-    plain = made()
-    assert not np.array_equal(plain, made("--sampler", "ddpm", "--steps", 4))
-    assert not np.array_equal(plain, made("--steps", 5))
-    by_name = made("--style", "B_e02")
-    by_file = made("--style", tiny_root / "vertices_npy" / "B_e02.npy")
-    assert not np.array_equal(plain, by_name)
-    assert np.array_equal(by_name, by_file)
-
-
 def write(path: Path, samples: np.ndarray, rate: int = 16000) -> Path:
     soundfile.write(path, samples, rate)
     return path
+
+
+@pytest.mark.parametrize("seconds", [pytest.param(1.0, marks=pytest.mark.slow), 10.6])
+def test_expressivity_goes_from_the_mean_to_the_sample(checkpoint: Path, tmp_path: Path, seconds: float) -> None:
+    """In one pass and by windows."""
+    speech = write(tmp_path / "speech.wav", 0.1 * np.random.default_rng(0).standard_normal(int(16_000 * seconds)))
+
+    def made(speech: Path, checkpoint: Path, *words: object) -> np.ndarray:
+        assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "x.npy", *words) == 0
+        return np.asarray(np.load(tmp_path / "x.npy"), np.float64)
+
+    sample, mean = (made(speech, checkpoint, "--seed", 3, "--expressivity", share) for share in (1, 0))
+    assert np.array_equal(mean, made(speech, checkpoint, "--seed", 4, "--expressivity", "0.0"))
+    assert np.array_equal(sample, made(speech, checkpoint, "--seed", 3))  # the bundled config's own is a sample
+    found = made(speech, checkpoint, "--seed", 3, "--expressivity", 1.5)
+    np.testing.assert_allclose(found, mean + 1.5 * (sample - mean), atol=1e-6)
+    assert np.abs(sample - mean).max() > 1e-4
 
 
 def test_bad_speech(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -122,9 +95,7 @@ def test_bad_speech(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("command", [["speech.wav"], ["-", "--stream"], ["folder"]])
 def test_a_seed_that_decides_nothing_is_refused(
-    command: list[str],
     speech: Path,
     checkpoint: Path,
     tmp_path: Path,
@@ -132,14 +103,8 @@ def test_a_seed_that_decides_nothing_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(DualPathDiffusion, "samples", False)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder").mkdir()
-    shutil.copy(speech, "folder")
-    words = ["--checkpoint", checkpoint, "-o", "out" if command == ["folder"] else "x.npy", "--seed", 3]
-    words += ["--suffix", ".npy", "--workers", 1] if command == ["folder"] else []
-    assert animate(*command, *words) in (1, 2)
-    told = capsys.readouterr()
-    assert "--seed" in told.out + told.err + "".join(path.read_text() for path in tmp_path.glob("out/*.csv"))
+    assert animate(speech, "--checkpoint", checkpoint, "-o", tmp_path / "x.npy", "--seed", 3) == 2
+    assert "--seed" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.npy"))
 
 
@@ -226,22 +191,6 @@ def test_metadata_says_how_an_animation_was_made(speech: Path, checkpoint: Path,
     assert animation.inner_lip_pairs is not None
     assert animation.speech is not None
     assert (len(animation.speech), animation.sample_rate) == (22050, 22050)  # the recording's own
-
-
-def test_half_precision_is_near_and_its_vertices_are_not_rounded(
-    speech: Path, checkpoint: Path, tmp_path: Path
-) -> None:
-    made = []
-    for precision in ("32", "bf16"):
-        path = tmp_path / f"{precision}.npz"
-        assert animate(speech, "--checkpoint", checkpoint, "-o", path, "--precision", precision) == 0
-        made.append(read_archive(path))
-    full, half = (animation.vertices - animation.template for animation in made)
-    assert 0 < np.abs(full - half).max() < 0.1 * np.abs(full).max()
-    assert half.dtype == np.float32
-    # Numbers of bfloat16 have 16 bits of nought at their end.
-    assert (half.view(np.uint32) & 0xFFFF).any()
-    assert made[1].metadata["precision"] == "bfloat16 and float32"
 
 
 def test_long_speech_goes_to_disk_window_by_window(checkpoint: Path, tmp_path: Path) -> None:

@@ -29,7 +29,6 @@ def run_demo(folder: Path, *words: str) -> dict[tuple[str, str], float]:
     assert "SYNTHETIC corpus puppet" in done.stdout
     names = METHOD_NAMES | {"sample_mean": "model"}  # of the model, one sample for each clip
     assert all(name in done.stdout for name in names.values())
-    assert done.stdout.count("the one that comes with facediff") == 3  # a line for each test split
     for file in ("truth_and_prediction_test_a.mp4", "truth_and_prediction_test_b.mp4", "puppet.ckpt"):
         assert (folder / "demo" / file).stat().st_size > 10_000
     with (folder / "demo" / "test_scores.csv").open() as stream:

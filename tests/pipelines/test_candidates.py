@@ -82,10 +82,8 @@ def test_motion_of_another_program_is_read_by_the_clips_names(tmp_path: Path) ->
 class Exported(Animator):
     """An exported model that was not trained on the face of the clips, and has it."""
 
-    identities = ["A"]  # type: ignore[assignment]  # noqa: RUF012 - in place of a property
-    other_identities = [SPEAKER]  # type: ignore[assignment]  # noqa: RUF012
-
     def __init__(self) -> None:
+        self.identities, self.other_identities = ["A"], [SPEAKER]
         self.asked: list[object] = []
 
     def animate(self, *_: object, **options: object) -> Animation:  # type: ignore[override]
