@@ -193,11 +193,6 @@ class ArgumentError(FaceDiffError, ValueError):
 
     Where it is raised, only the argument's own name is known. The caller of that constructor knows which option it is,
     and replaces the name by a path such as ``model.decoder.num_heads``; the command line writes it as an option.
-
-    Args:
-        values: the arguments with their values.
-        problem: the expectation and the remedy.
-        located: whether the names are paths already.
     """
 
     def __init__(self, values: Mapping[str, object], problem: str, *, located: bool = False) -> None:
@@ -231,13 +226,7 @@ class NotFiniteError(FaceDiffError, ValueError):
 
 
 class MissingExtraError(FaceDiffError):
-    """The optional packages of a feature are not installed.
-
-    Args:
-        package: import name of the missing package.
-        extra: the extra of facediff that brings it.
-        feature: the feature that needs it, in words.
-    """
+    """The optional packages of a feature are not installed."""
 
     def __init__(self, package: str, extra: str, feature: str) -> None:
         self.arguments = package, extra, feature
@@ -283,12 +272,6 @@ def damaged(source: object, remedy: str, *errors: type[Exception]) -> Iterator[N
 
     The code inside takes its fields (``content["sizes"][0]``) and raises ValueError for values that would otherwise
     pass without a word; it needs no check where Python refuses by itself.
-
-    Args:
-        source: the file, or a part of it.
-        remedy: what to do about it.
-        errors: exceptions of the library that reads it, beyond those by which Python refuses keys, indices, types and
-            values; all become a :class:`FaceDiffError`.
 
     Example:
         >>> with damaged("take.json", "export it again"):

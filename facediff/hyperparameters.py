@@ -98,30 +98,16 @@ def describe(factory: Any, component: object) -> dict[str, Any]:  # noqa: ANN401
 
     Options left at their defaults are included: code that rebuilds the component may fill missing options from the
     component that usually stands in its place.
-
-    Args:
-        factory: the component's class, or a ``functools.partial`` of it.
-        component: made by the factory. It may have a method ``checkpoint_init_args`` that returns constructor
-            arguments with which it can be built without the files that it was first built from (a pretrained network).
     """
     description: dict[str, Any] = plain(factory)
+    # Arguments that need no files such as those of a pretrained network.
     portable: dict[str, Any] = getattr(component, "checkpoint_init_args", dict)()
     description["init_args"] = plain({**defaults(component_class(factory)), **description["init_args"], **portable})
     return description
 
 
 def read_options(source: str, owner: type, options: Mapping[str, Any], components: Components) -> dict[str, Any]:
-    """The arguments of a constructor from the options in a file, or an error where they are anything but plain values.
-
-    Args:
-        source: the file, for messages.
-        owner: the class, which is known to be registered.
-        options: its constructor's arguments as plain data.
-        components: the kinds of components; an option of a kind's name takes one.
-
-    Returns:
-        the arguments as the constructor takes them: a component as ``functools.partial`` of its class.
-    """
+    """The arguments of a constructor from the plain options in a file; a component as ``partial`` of its class."""
     parameters = options_of(owner)
     arguments: dict[str, Any] = {}
     for name, value in options.items():
@@ -180,22 +166,6 @@ def takes_options(group: type) -> Callable[[Callable[..., None]], Callable[..., 
     The constructor itself receives them as an instance of the dataclass, in front of its other options. Its signature
     and its docstring come from the fields, so that the command line, checkpoints and documentation show each option.
 
-    Args:
-        group: a dataclass with a default for every field.
-
-    Example:
-        >>> from dataclasses import dataclass
-        >>> @dataclass(kw_only=True)
-        ... class Size:
-        ...     width: int = 2
-        >>> class Box:
-        ...     @takes_options(Size)
-        ...     def __init__(self, size: Size, **common: int) -> None:
-        ...         self.size = size
-        >>> Box(width=3).size
-        Size(width=3)
-        >>> list(inspect.signature(Box).parameters)
-        ['width', 'common']
     """
     hints_by_name = hints.hints_of(group)
 

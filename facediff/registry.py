@@ -62,21 +62,13 @@ class Entry:
 
 
 class Kind:
-    """The components of one kind, by name.
-
-    Args:
-        name: of the kind.
-        modules: import paths of the modules that register the built-in ones, separated by spaces; of all modules of a
-            package with ``.*`` behind it.
-        title: purpose of an entry of this kind, in a few words.
-        component: whether models are made of it; its options are then checked as options of the model.
-    """
+    """The components of one kind, by name."""
 
     def __init__(self, name: str, modules: str, title: str, *, component: bool = False) -> None:
         self.kind = name
         self.title = title
-        self.component = component
-        self._modules = modules.split()
+        self.component = component  # of models, whose options are checked as options of the model
+        self._modules = modules.split()  # which register the built-in ones; of a package all with .* behind it
         self._entries: dict[str, Entry] = {}
         self._loaded = False
 

@@ -58,22 +58,10 @@ def animate_folder(
     scheduler: str | None = "",
     retry_failed: bool = False,
 ) -> int:
-    """Animate many recordings into a folder.
+    """Animate recordings and folders of them into a folder; the exit status, 1 if a recording failed.
 
-    Args:
-        options: how each recording is animated. From its seed follows each recording's own, together with the name of
-            the recording's file; recordings that last longer than ``max_seconds`` fail.
-        speech: recordings, and folders of them.
-        output: folder for the animations.
-        suffix: format of the animations.
-        export: how the files are written.
-        workers: recordings at a time; as many as processors if None, one on an accelerator, which holds one model, or
-            all workers of a cluster.
-        scheduler: where recordings are animated; see :func:`facediff.utils.jobs.run_tasks`.
-        retry_failed: try recordings again that failed before.
-
-    Returns:
-        the exit status: 0 if all animations are there, 1 if a recording failed.
+    A recording's seed follows from the options' seed and the name of its file. Without ``workers``, as many recordings
+    are animated at a time as there are processors, one on an accelerator, or all that a cluster's workers take.
     """
     check_known("{suffix}", "format", [suffix], FORMATS)
     if output.suffix in FORMATS and not output.is_dir():
@@ -226,14 +214,10 @@ def run_folder(
     scheduler: str | None = "",
     retry_failed: bool = False,
 ) -> int:
-    """Animate recordings into a folder.
+    """Animate recordings into a folder by a worker that is made once in each process, with the command.
 
-    Outputs that an earlier run has made of the same recording, options and files are kept, and a recording that failed
-    is tried again only if something has changed or ``retry_failed`` is given. Each output appears whole or not at all.
-    Ctrl-C waits for the recordings that are being animated; the same command continues.
-
-    ``command`` and ``files`` are the options and the files (checkpoint, styles …) that decide the result.
-    ``make_worker``, a function of a module, is called once in each process with the command.
+    Outputs that an earlier run has made of the same recording, command (the options) and files (checkpoint, styles …)
+    are kept, and a recording that failed is tried again only if something has changed or ``retry_failed`` is given.
     """
     if workers is not None and workers < 1:  # 0 would mean the usual number, without a word
         raise OptionError("workers", "expected 1 or more", workers)

@@ -176,12 +176,8 @@ class Page:
         page = self if length <= TRIED_FRAMES else self.beginning(TRIED_FRAMES)
         text = page.html()
         if page is not self:
-            frames = min(length, max(TRIED_FRAMES, int(TRIED_FRAMES * INLINE_MB / (len(text) / 1e6))))
+            frames = min(length, max(TRIED_FRAMES, int(0.95 * TRIED_FRAMES * INLINE_MB / (len(text) / 1e6))))
             page = self if frames == length else self.beginning(frames)
-            text = page.html()
-        while (size := len(text) / 1e6) > INLINE_MB and frames > 1:
-            frames = max(1, min(frames - 1, int(0.95 * frames * INLINE_MB / size)))
-            page = self.beginning(frames)
             text = page.html()
         note = ""
         if page is not self:
