@@ -1,14 +1,13 @@
 """The referee: models on one face, scored against the known phonemes of their speech.
 
 It needs no recording of a person: closures and the mouth's opening follow from the phonemes; blinks and head, which do
-not, are reported without a judgement. Faults are planted in every model's motion, and the scores must detect them.
-From top to bottom: the scores, the faults, the rows of the report.
+not, are reported without a judgement.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -28,7 +27,7 @@ from facediff.metrics import (
 )
 from facediff.metrics.mouth import opening
 from facediff.speech.phonemes import TimedPhoneme, closures
-from facediff.synthetic.spoken_set import LANGUAGES, OpenFace, SpokenClip, SpokenMotion, open_face, reference
+from facediff.synthetic.spoken_set import LANGUAGES, SpokenClip, SpokenMotion, open_face, reference
 from facediff.utils.cross_correlation import correlations, peak
 
 Array = npt.NDArray[np.float64]
@@ -204,90 +203,13 @@ def as_pair(series: Array) -> torch.Tensor:
     return torch.from_numpy(pair)
 
 
-# Faults.
-
-DELAY, MUTED, JITTER = 0.08, 0.2, 0.5
-"""Seconds of delay; share that is left of the lips' motion; noise, as a share of each point's own deviation."""
-
-CLOSES, FOLLOWS, LIVELY, SHIVERS = 0.5, 0.1, 2.0, 1.6
-"""Closures and correlation below which, and motion and jitter of the lips above which, a model has the fault already: a
-mouth that does not follow its speech loses nothing by another sentence."""
-
-Fault = Callable[[SpokenMotion, SpokenMotion, float, OpenFace], Array]
-"""Spoils the points of a clip; it is handed the clip, another sentence, the frame rate and the face."""
-
-
-def delayed(motion: SpokenMotion, _other: SpokenMotion, frame_rate: float, _face: OpenFace) -> Array:
-    """Everything comes later."""
-    times = np.maximum(np.arange(len(motion.points)) - DELAY * frame_rate, 0)
-    before = times.astype(np.int64)
-    after, share = np.minimum(before + 1, len(times) - 1), (times - before)[:, None, None]
-    return np.asarray((1 - share) * motion.points[before] + share * motion.points[after])
-
-
-def muted(motion: SpokenMotion, _other: SpokenMotion, _frame_rate: float, face: OpenFace) -> Array:
-    """Lips stay nearly as they are at rest; of channels, all of them do."""
-    points = motion.points.copy()
-    if points.shape[1:] != face.rest.shape:
-        return np.asarray(MUTED * points)
-    lips = np.union1d(face.lips, face.lip_pairs)
-    points[:, lips] = face.rest[lips] + MUTED * (points[:, lips] - face.rest[lips])
-    return points
-
-
-def trembling(motion: SpokenMotion, _other: SpokenMotion, _frame_rate: float, _face: OpenFace) -> Array:
-    """The face shakes from frame to frame, in proportion to each point's motion."""
-    noise = np.random.default_rng(len(motion.points)).normal(size=(len(motion.points), 1, 1))
-    return np.asarray(motion.points + JITTER * noise * motion.points.std(axis=0))
-
-
-def wrong_sentence(motion: SpokenMotion, substitute: SpokenMotion, _frame_rate: float, _face: OpenFace) -> Array:
-    """Motion for another sentence; its last frame is held if it is shorter."""
-    return np.asarray(substitute.points[np.minimum(np.arange(len(motion.points)), len(substitute.points) - 1)])
-
-
-@dataclass(frozen=True)
-class PlantedFault:
-    """A fault and the scores that must detect it."""
-
-    title: str  # of its row
-    spoil: Fault  # makes it
-    seen_by: tuple[str, ...]  # scores that must be worse than the sound model's
-
-
-FAULTS = {
-    "delay": PlantedFault("80 ms late", delayed, ("closures", "closure_auc", "gap", "correlation", "lag")),
-    # Lips that hardly part close in time, so that closures alone would call such a model good.
-    "muted": PlantedFault("muted lips", muted, ("open_vowels", "rounding", "lips", "step")),
-    "jitter": PlantedFault("jitter", trembling, ("jitter",)),
-    "sentence": PlantedFault("wrong sentence", wrong_sentence, ("closures", "closure_auc", "gap", "correlation")),
-}
-
-
-@dataclass(frozen=True)
-class FaultVerdict:
-    """Whether a score detects a fault: its values for the sound model and for the spoilt one."""
-
-    fault: str
-    score: str
-    sound: float
-    spoilt: float
-
-    @property
-    def seen(self) -> bool:
-        """Whether the spoilt motion is worse."""
-        score = SCORES[self.score]
-        return score.badness(self.spoilt) > score.badness(self.sound)
-
-
 @dataclass(frozen=True)
 class Judgement:
-    """A row of the report, with the scores of its planted faults."""
+    """A row of the report."""
 
     name: str
     # By name, as far as there are any; ``closures_de`` and so on by language
     scores: Mapping[str, float] = field(default_factory=dict)
-    faults: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # the scores of each planted fault
     # How it was put on the open face, its licence and so on, by title
     facts: Mapping[str, str] = field(default_factory=dict)
     seconds: float | None = None  # of the processor for a second of speech; None if not measured
@@ -295,66 +217,12 @@ class Judgement:
     frame_rate: float = 25.0
     problem: str = ""  # why there are no scores; empty if there are
 
-    def seen(self) -> list[FaultVerdict]:
-        """The verdict of each score on the faults that it must detect, where it has a value."""
-        return [
-            FaultVerdict(fault, score, self.scores[score], values[score])
-            for fault, values in self.faults.items()
-            for score in FAULTS[fault].seen_by
-            if score in self.scores and score in values and not self.lacks(score)
-        ]
-
-    def lacks(self, score: str) -> str:
-        """Why a score cannot detect faults in this model, in words; empty if it can."""
-        if score in ("closures", "closure_auc", "gap") and self.scores.get("closures", 1) < CLOSES:
-            return f"it closes its lips for fewer than {100 * CLOSES:.0f} % of p, b and m"
-        if score in ("correlation", "lag") and self.scores.get("correlation", 0) < FOLLOWS:
-            return "its mouth does not follow the speech"
-        if score in ("open_vowels", "rounding") and self.scores.get(score, 1) <= MUTED:
-            return "it hardly opens or rounds its mouth"
-        if score in ("lips", "step") and self.scores.get(score, 0) > LIVELY:
-            return f"its lips move more than {LIVELY:g} times as much as the reference's"
-        if score == "jitter" and self.scores.get("jitter", 0) > SHIVERS:
-            return "it shivers already"
-        return ""
-
 
 def judge(
     clips: Sequence[SpokenClip], motions: Mapping[str, SpokenMotion], frame_rate: float, jaw: int | None
-) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """The scores of a model and of its planted faults."""
-    truths = {clip.name: reference(clip, frame_rate) for clip in clips}
-    sound = RefereeScores(frame_rate, jaw)
+) -> dict[str, float]:
+    """The scores of a model's motion of all clips, by their names."""
+    scores = RefereeScores(frame_rate, jaw)
     for clip in clips:
-        sound.add(clip, motions[clip.name], truths[clip.name])
-    faults = {}
-    for name, fault in FAULTS.items():
-        if name == "sentence" and len({clip.text for clip in clips}) < 2:
-            continue
-        spoilt = RefereeScores(frame_rate, jaw)
-        for clip in clips:
-            motion = motions[clip.name]
-            points = fault.spoil(motion, motions[another(clip, clips).name], frame_rate, open_face())
-            spoilt.add(clip, SpokenMotion(points, motion.head), truths[clip.name])
-        faults[name] = spoilt.scores()
-    return sound.scores(), faults
-
-
-def another(clip: SpokenClip, clips: Sequence[SpokenClip]) -> SpokenClip:
-    """The next sentence of the same voice, or else of the same language, or else of any."""
-    index = [candidate.name for candidate in clips].index(clip.name)
-    candidates = [candidate for candidate in (*clips[index + 1 :], *clips[:index]) if candidate.text != clip.text]
-    for alike in ("voice", "language"):
-        same = [candidate for candidate in candidates if getattr(candidate, alike) == getattr(clip, alike)]
-        if same:
-            return same[0]
-    return candidates[0] if candidates else clip
-
-
-def reference_judgement(clips: Sequence[SpokenClip], frame_rate: float = 25.0) -> Judgement:
-    """The row of the reference itself, without planted faults."""
-    scores = RefereeScores(frame_rate)
-    for clip in clips:
-        motion = reference(clip, frame_rate)
-        scores.add(clip, motion, motion)
-    return Judgement("reference", scores.scores(), frame_rate=frame_rate)
+        scores.add(clip, motions[clip.name], reference(clip, frame_rate))
+    return scores.scores()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from facediff.benchmark.referee import FAULTS, SCORES, Judgement
+from facediff.benchmark.referee import SCORES, Judgement
 from facediff.reporting.documents import (
     BEST,
     NONE,
@@ -51,7 +51,7 @@ def write_report(report: RefereeReport, folder: Path) -> list[Path]:
 
 def text(report: RefereeReport) -> str:
     """For the terminal."""
-    return "\n" + terminal_text([scores_table(report), *languages_and_costs(report), Bullets(self_check(report))])
+    return "\n" + terminal_text([scores_table(report), *languages_and_costs(report)])
 
 
 def document(report: RefereeReport) -> list[Block]:
@@ -65,9 +65,6 @@ def document(report: RefereeReport) -> list[Block]:
         ),
         scores_table(report),
         *languages_and_costs(report),
-        Title("Check of the scores", 2),
-        Paragraph("Faults were planted in every model's motion; the scores that must detect them must be worse."),
-        Bullets(self_check(report)),
         Title("Definitions", 2),
         Bullets(
             [
@@ -87,21 +84,18 @@ def document(report: RefereeReport) -> list[Block]:
 
 
 def scores_table(report: RefereeReport) -> ReportTable:
-    """A row for each model, the reference and each planted fault."""
-    sound = [*report.rows]
-    rows: list[list[str]] = [[row.name, *_cells(row.scores)] for row in sound]
+    """A row for each model, and the reference."""
+    rows = [[row.name, *_cells(row.scores)] for row in [*report.rows, report.reference]]
     marks: dict[tuple[int, int], str] = {}
     for column, (name, score) in enumerate(SCORES.items(), 1):
-        values = [(score.badness(row.scores[name]), index) for index, row in enumerate(sound) if name in row.scores]
+        values = [
+            (score.badness(row.scores[name]), index) for index, row in enumerate(report.rows) if name in row.scores
+        ]
         if score.ideal is not None and len(values) > 1:
             best = min(values)[0]
             marks |= {(index, column): BEST for value, index in values if value == best}
-    rows.append([report.reference.name, *_cells(report.reference.scores)])
-    rows += [
-        [f"{row.name}, {FAULTS[fault].title}", *_cells(values)] for row in sound for fault, values in row.faults.items()
-    ]
     head = ["", *(score.title + ARROWS.get(str(score.ideal), "") for score in SCORES.values())]
-    return ReportTable(head, rows, marks, frozenset(range(len(sound), len(rows))))
+    return ReportTable(head, rows, marks, frozenset({len(report.rows)}))
 
 
 def _cells(scores: Mapping[str, float]) -> list[str]:
@@ -132,37 +126,15 @@ def languages_and_costs(report: RefereeReport) -> list[Block]:
     return [ReportTable(head, rows), Bullets(notes)]
 
 
-def self_check(report: RefereeReport) -> list[str]:
-    """Which planted faults the scores detect, a line for each model and fault."""
-    lines = []
-    for row in report.rows:
-        for fault, planted in FAULTS.items() if not row.problem else ():
-            checks = [check for check in row.seen() if check.fault == fault]
-            changes = [
-                f"{SCORES[check.score].title} {check.sound:.{SCORES[check.score].digits}f} → "
-                f"{check.spoilt:.{SCORES[check.score].digits}f}{'' if check.seen else ' (NOT SEEN)'}"
-                for check in checks
-            ]
-            reasons = dict.fromkeys(reason for score in planted.seen_by if (reason := row.lacks(score)))
-            changes += [f"not asked further, since {' and '.join(reasons)}"] if reasons else []
-            if not changes:
-                changes = ["no score of this model can detect it"]
-            count = sum(check.seen for check in checks)
-            verdict = "the referee sees" if checks and count == len(checks) else "NOT SEEN by all scores:"
-            lines.append(f"{verdict if checks else 'no score for'} {row.name}, {planted.title}: {'; '.join(changes)}")
-    return lines
-
-
 def csv_rows(report: RefereeReport) -> list[dict[str, Any]]:
-    """One row for each model and planted fault."""
+    """One row for each model, and the reference."""
     names = [*SCORES, *(f"closures_{code}" for code in LANGUAGES)]
-    rows = []
-    for row in [*report.rows, report.reference]:
-        facts = {"cpu_seconds_per_second": row.seconds, "memory_bytes": row.memory, "problem": row.problem}
-        for fault, values in [("", row.scores), *row.faults.items()]:
-            scores = {name: values.get(name) for name in names}
-            rows.append({"model": row.name, "fault": fault, **scores, **(facts if not fault else dict.fromkeys(facts))})
-    return rows
+    return [
+        {"model": row.name}
+        | {name: row.scores.get(name) for name in names}
+        | {"cpu_seconds_per_second": row.seconds, "memory_bytes": row.memory, "problem": row.problem}
+        for row in [*report.rows, report.reference]
+    ]
 
 
 def content(report: RefereeReport) -> dict[str, Any]:
@@ -179,8 +151,6 @@ def content(report: RefereeReport) -> dict[str, Any]:
             {
                 "name": row.name,
                 "scores": dict(row.scores),
-                "faults": {fault: dict(values) for fault, values in row.faults.items()},
-                "sees": {f"{check.fault}/{check.score}": check.seen for check in row.seen()},
                 "facts": dict(row.facts),
                 "cpu_seconds_per_second": row.seconds,
                 "memory_bytes": row.memory,

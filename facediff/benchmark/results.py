@@ -81,13 +81,6 @@ class Result:
         return cls(**_of(cell), problem=problem, machine=machine)
 
     @property
-    def total_seconds(self) -> float | None:
-        """Seconds of all steps; None if one is not known."""
-        seconds = [step.get("seconds") for step in self.measured.values()]
-        measured = [value for value in seconds if value is not None]
-        return sum(measured) if measured and len(measured) == len(seconds) else None
-
-    @property
     def training_seconds(self) -> float | None:
         """Seconds of all trainings; None if nothing was trained."""
         steps = [step for name, step in self.measured.items() if not name.startswith(("test", "evaluate"))]

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from facediff.benchmark.cells import Cell, Training, config_content, hash_of
-from facediff.benchmark.results import CELLS, Result, cell_file, model_result, predictions_result, read_result
+from facediff.benchmark.results import Result, cell_file, model_result, predictions_result, read_result
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
@@ -313,16 +313,3 @@ def machine_of(threads: int) -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": str(torch.__version__),
     }
-
-
-# How long it will take, by the last timings.
-
-
-def estimate(cells: Sequence[Cell], folder: Path) -> dict[Cell, float | None]:
-    """Seconds that each cell will take: as long as the latest of its row on its corpus; None where there was none."""
-    latest: dict[tuple[str, str], float | None] = {}
-    for path in sorted((folder / CELLS).glob("*.json"), key=lambda path: path.stat().st_mtime):
-        result = read_result(path)
-        if result is not None and not result.problem:
-            latest[result.row, result.corpus] = result.total_seconds
-    return {cell: latest.get((cell.row, cell.corpus)) for cell in cells}

@@ -52,7 +52,7 @@ def benchmark(
         workers: cells at a time (default: the plan's, or as many as processors allow)
         scheduler: where tasks run: processes, threads, or tcp://HOST:PORT of a Dask cluster (docs/cluster.md)
         retry_failed: try cells again that failed
-        dry_run: list the cells that would run, with times by the last timings
+        dry_run: list the cells that would run
     """
     from facediff.benchmark.plan import check_scores, find_plan, read_plan
     from facediff.utils.jobs import is_cluster
@@ -61,7 +61,7 @@ def benchmark(
     definition = read_plan(find_plan(plan), corpus_folders(root or []))
     from facediff.benchmark.cells import cells_of
     from facediff.benchmark.outline import outline_of, read_results, write_outline
-    from facediff.benchmark.running import estimate, pending, run_cells
+    from facediff.benchmark.running import pending, run_cells
     from facediff.utils.files import locked
 
     check_scores(definition)
@@ -72,8 +72,7 @@ def benchmark(
         workers or definition.workers or (None if is_cluster(scheduler) else max(1, processors() // definition.threads))
     )
     setting, tests = check_cells(definition, left, folder, dry_run=dry_run)
-    seconds = estimate(left, folder)
-    announce(definition, cells, left, seconds, tests, count)
+    announce(definition, cells, left, tests, count)
     if dry_run:
         return 0
     roots = [word for folder_of_corpus in root or [] for word in ("--root", folder_of_corpus)]
@@ -155,32 +154,18 @@ def announce(
     plan: BenchmarkPlan,
     cells: Sequence[Cell],
     left: Sequence[Cell],
-    seconds: Mapping[Cell, float | None],
     tests: Mapping[tuple[str, str], str],
     workers: int | None,
 ) -> None:
-    """List the cells that will run, with the size of their tests and with times."""
+    """List the cells that will run, with the size of their tests."""
     from facediff.utils.text_tables import format_table
 
     at_a_time = f"{workers} at a time" if workers else "one on each worker at a time"
     tell(f"{plan.title}: {counted(len(cells), 'cell')}, {len(cells) - len(left)} done, {len(left)} to run, {at_a_time}")
     if not left:
         return
-    last = [None if seconds[cell] is None else f"{seconds[cell]:.0f} s" for cell in left]
-    rows = [
-        [str(cell), cell.kind, tests.get((cell.row, cell.corpus)), time] for cell, time in zip(left, last, strict=True)
-    ]
-    tell(*format_table(["to run", "", "test generates", "last time"], rows, left=2).split("\n"))
-    timed = [value for value in seconds.values() if value is not None]
-    untimed = len(left) - len(timed)
-    if timed:
-        # With one worker the times add up; several share them, and the longest cell is the least that it takes.
-        total = max(sum(timed) / (workers or 1), max(timed))
-        unknown = f", and {counted(untimed, 'cell')} without a timing" if untimed else ""
-        worker = "" if workers else " on one worker"
-        tell(f"about {total / 60:.0f} minutes{worker} by the last timings{unknown}")
-    else:
-        tell("no cell of these was ever timed here")
+    rows = [[str(cell), cell.kind, tests.get((cell.row, cell.corpus))] for cell in left]
+    tell(*format_table(["to run", "", "test generates"], rows, left=2).split("\n"))
 
 
 def write_and_tell(

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from facediff.synthetic.spoken_set import SpokenClip
 
 PLANS = (".yaml", ".yml")
+FRAME_RATE = 25.0  # of the reference
 
 
 def referee(
@@ -40,7 +41,7 @@ def referee(
 
     MODEL is NAME=PATH or PATH of a checkpoint, a model folder, an exported folder or a folder of Audio2Face-3D, or a
     plan (.yaml) of them; puppet, or none, is the model that comes with facediff. Closures, timing, jitter, blinks,
-    head, languages, cost and licence are reported, and four faults that are planted in every model must be seen.
+    head, languages, cost and licence are reported.
     Exit status: 0 all scored, 1 some models could not be scored, 2 something to put right.
 
     For example:
@@ -61,7 +62,7 @@ def referee(
         sentences: sentences of each voice
         write_speech: write the speech for models that run elsewhere, and do nothing else
     """
-    from facediff.synthetic.spoken_set import LANGUAGES, spoken_set, write_spoken_set
+    from facediff.synthetic.spoken_set import LANGUAGES, reference, spoken_set, write_spoken_set
 
     if write_speech is None:
         import facediff.benchmark.referee  # noqa: F401 - a missing package is named before any synthesis
@@ -72,7 +73,7 @@ def referee(
         write_spoken_set(clips, write_speech)
         tell(f"written: {len(clips)} recordings in {write_speech / 'wav'}; call motion as they are called")
         return 0
-    from facediff.benchmark.referee import reference_judgement
+    from facediff.benchmark.referee import Judgement, judge
     from facediff.benchmark.referee_report import RefereeReport, text, write_report
     from facediff.benchmark.results import code_of
     from facediff.metrics import device_name
@@ -89,7 +90,9 @@ def referee(
     options += [f"--flame={flame}"] if flame is not None else []
     options += [f"--languages={','.join(codes)}", f"--voices={voices}", f"--sentences={sentences}"]
     command = shlex.join(["facediff", "benchmark", "referee", *options])
-    report = RefereeReport(clips, reference_judgement(clips), rows, command, code_of(), device_name("cpu"))
+    truth = judge(clips, {clip.name: reference(clip, FRAME_RATE) for clip in clips}, FRAME_RATE, None)
+    standard = Judgement("reference", truth, frame_rate=FRAME_RATE)
+    report = RefereeReport(clips, standard, rows, command, code_of(), device_name("cpu"))
     files = write_report(report, output)
     tell(*text(report).split("\n"), *(f"written: {path}" for path in files))
     return int(any(row.problem for row in rows))
@@ -106,9 +109,9 @@ def judged(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None
         return Judgement(candidate.name, problem="killed its process, perhaps for lack of memory")
     if isinstance(motion, str):
         return Judgement(candidate.name, problem=motion)
-    scores, faults = judge(clips, motion.clips, motion.frame_rate, motion.jaw)
+    scores = judge(clips, motion.clips, motion.frame_rate, motion.jaw)
     facts = {"put on the face": motion.way, "licence": motion.licence, "commercial use": motion.commercial_use}
-    return Judgement(candidate.name, scores, faults, facts, motion.seconds, motion.memory, motion.frame_rate)
+    return Judgement(candidate.name, scores, facts, motion.seconds, motion.memory, motion.frame_rate)
 
 
 def candidates_of(

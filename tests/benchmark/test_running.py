@@ -22,7 +22,6 @@ from facediff.benchmark.running import (
     STATE,
     Runner,
     Setting,
-    estimate,
     pending,
     run_cells,
 )
@@ -199,15 +198,6 @@ def test_killed_and_started_again_the_table_is_that_of_another_benchmark_with_th
     os.rename(folder / "out", folder / "killed")
     run(folder)
     assert report(folder) == killed
-
-
-def test_the_estimate_is_the_time_of_the_last_run(folder: Path) -> None:
-    cells = cells_of(read_plan(folder / "plan.yaml"))
-    assert set(estimate(cells, folder / "out").values()) == {None}
-    ((_, outcome),) = run_cells(cells[:1], setting(folder), workers=1)
-    assert outcome.result is not None
-    seconds = outcome.result.total_seconds
-    assert estimate(cells, folder / "out") == {cell: seconds if cell.row == cells[0].row else None for cell in cells}
 
 
 def test_the_best_weights_are_not_replaced_by_the_last(folder: Path) -> None:
