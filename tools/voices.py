@@ -28,7 +28,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, fields
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -43,9 +43,10 @@ import facediff
 from facediff.animation.options import GROUPS
 from facediff.cli.parsing import parameters_of
 from facediff.data import Puppet, Sample
-from facediff.data.articulation import MouthMotion, mouth_motion
+from facediff.data.articulation import ArticulationScores, MouthMotion, articulation, mouth_motion
 from facediff.data.track.face import pair_distances
-from facediff.evaluation.articulation import by_speaker
+from facediff.reporting.scores import ScoreMatrix
+from facediff.reporting.statistics import Bootstrap
 from facediff.speech.audio import fit_length
 from facediff.speech.espeak import Utterance
 from facediff.speech.phonemes import TimedPhoneme, closures, phonemes_file, read_phonemes
@@ -316,10 +317,13 @@ class Bench:
             facts = {"millimetres": 1.0, "frame_rate": self.model.frame_rate, "phonemes": phonemes}
             made, template = self.animate(speech, sample), sample.template.double().numpy() * 1000
             mouths.setdefault(name, []).append(mouth_motion(made, template, self.pairs, **facts))
-        found = by_speaker(mouths)
-        _, interval = found["closure_auc"]
+        values = np.array([astuple(articulation(each)) for each in mouths.values()])
+        table = ScoreMatrix.of([*mouths], values, np.ones_like(values))
+        names = [field.name for field in fields(ArticulationScores)]
+        interval = table.intervals(Bootstrap())[names.index("closure_auc")]
         half = (interval.high - interval.low) / 2 if interval else float("nan")
-        return {**{name: mean for name, (mean, _) in found.items()}, "AUC ±": half, "n": len(mouths)}
+        means = {name: mean for name, mean in zip(names, table.pool().tolist(), strict=True) if np.isfinite(mean)}
+        return {**means, "AUC ±": half, "n": len(mouths)}
 
     def spoken(self, samples: Sequence[Sample], change: Change) -> tuple[Array, Array, Array, Array]:
         """Of each closure: whether the lips close, by chance, and the gap in mm; of each frame: the squared error."""
