@@ -11,7 +11,7 @@ from facediff.errors import FaceDiffError
 from facediff.utils.files import example_recordings
 from facediff.utils.hub import is_audio2face, model_or_bundled
 from facediff.utils.option import Option
-from facediff.utils.server import require_server
+from facediff.utils.server import names_of, require_server, run_server
 
 
 def serve(
@@ -42,7 +42,7 @@ def serve(
         require_server("serving a page", extra="serve")
     from facediff.runtime.folder import read_folder
     from facediff.runtime.onnxruntime_web import web_runtime
-    from facediff.runtime.site import make_site, serve_site, write_site
+    from facediff.runtime.site import make_app, make_site, write_site
 
     model = model_or_bundled(model)
     if is_audio2face(model):
@@ -56,4 +56,5 @@ def serve(
     announce = page.announce(
         f"animates with {model}; Ctrl-C ends it", "open the page; without https it gets no microphone"
     )
-    serve_site(site, host=page.host, port=8010 if page.port is None else page.port, ready=announce)
+    port = 8010 if page.port is None else page.port
+    run_server(lambda _: make_app(site, names_of(page.host)), host=page.host, port=port, ready=announce)

@@ -128,10 +128,6 @@ class Microphone(SpeechSource):
         self.name = f"microphone {about['name']}"
         self.lost = 0
         """Blocks that came too fast for PortAudio."""
-        try:
-            self._sound.check_input_settings(device=self._device, channels=1, dtype="float32", samplerate=self.rate)
-        except (self._sound.PortAudioError, ValueError) as error:
-            raise _refused(self.name, error) from error
 
     def run(self, deliver: Deliver, stopped: threading.Event) -> None:
         """Hand over blocks as PortAudio gives them, in its thread."""
@@ -163,8 +159,10 @@ class Microphone(SpeechSource):
                         raise broken[0]
                     if not stream.active or time.monotonic() - latest[0] > SILENT:
                         raise FaceDiffError(f"{self.name}: gives no sound any more; connect it again")
-        except (self._sound.PortAudioError, OSError) as error:
-            raise _refused(self.name, error) from error
+        except (self._sound.PortAudioError, OSError, ValueError) as error:
+            raise FaceDiffError(
+                f"{self.name}: cannot be opened ({error}); close what uses it, or choose another device"
+            ) from error
 
 
 def sound_library() -> Any:  # noqa: ANN401 - a module without types
@@ -208,7 +206,3 @@ def find_device(library: Any, device: str) -> tuple[int, dict[str, Any]]:  # noq
     names = [f"{number}: {facts['name']}" for number, facts in fit.items()]
     problem = "several devices are called so" if matches else "there is no input device of this name or number"
     raise FaceDiffError(f"--microphone {device}: {problem}; {choices(device, names)}")
-
-
-def _refused(name: str, error: Exception) -> FaceDiffError:
-    return FaceDiffError(f"{name}: cannot be opened ({error}); close what uses it, or choose another device")

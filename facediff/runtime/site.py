@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import html
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -31,7 +31,7 @@ from facediff.speech.windows import LOW_LATENCY_AHEAD
 from facediff.utils.checksums import sha256
 from facediff.utils.files import atomic_folder, valid_text
 from facediff.utils.server import HEADERS as SERVED
-from facediff.utils.server import names_of, own_page_only, require_server, run_server
+from facediff.utils.server import own_page_only
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -207,18 +207,3 @@ def make_app(site: Site, hosts: tuple[str, ...] | None) -> Starlette:
         # WebAssembly takes a quarter of its room so, and the model's numbers three quarters.
         middleware=[*own_page_only(hosts), Middleware(GZipMiddleware, compresslevel=5)],
     )
-
-
-def serve_site(
-    site: Site, *, host: str = "127.0.0.1", port: int = 0, ready: Callable[[str], object] | None = None
-) -> None:
-    """Serve a site until Ctrl-C.
-
-    Args:
-        site: its files.
-        host: address to listen at; by default only this machine reaches it.
-        port: to listen at; 0 for any free one.
-        ready: called with the page's address as soon as it can be opened.
-    """
-    require_server("serving a page", extra="serve")
-    run_server(lambda _: make_app(site, names_of(host)), host=host, port=port, ready=ready)

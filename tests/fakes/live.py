@@ -151,7 +151,6 @@ class FakeSound(SimpleNamespace):
             PortAudioError=PortAudioError,
             default=SimpleNamespace(device=(usual, usual)),
             query_devices=lambda: devices,
-            check_input_settings=lambda **_: None,
             InputStream=lambda **words: self._open(**words),
         )
         self.refuse, self.opened = refuse, list[Any]()

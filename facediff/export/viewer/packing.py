@@ -139,9 +139,9 @@ def mouth_opening(animation: Animation) -> npt.NDArray[np.float32] | None:
     return np.asarray(measured(animation.vertices, opening) * millimetres(animation), np.float32)
 
 
-def bounds(animation: Animation) -> tuple[list[float], list[float]]:
-    """Centre and half extents (x, y, z) of the template's surface, in mm."""
-    surface = np.asarray(animation.template, np.float64)[np.unique(animation.triangles)] * millimetres(animation)
+def bounds(points: npt.NDArray[np.floating], triangles: npt.NDArray[np.integer]) -> tuple[list[float], list[float]]:
+    """Centre and half extents (x, y, z) of the surface of points (V, 3) with triangles (F, 3)."""
+    surface = points[np.unique(triangles)]
     low, high = surface.min(axis=0), surface.max(axis=0)
     return ((low + high) / 2).round(3).tolist(), ((high - low) / 2).round(3).tolist()
 

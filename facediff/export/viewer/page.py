@@ -22,7 +22,6 @@ from facediff.editing.controls.expressiveness import ALL, region_factors
 from facediff.editing.controls.procedural import neck
 from facediff.errors import FaceDiffError
 from facediff.export.format import Format, check_animation, outward, speech_wav
-from facediff.export.viewer.channels import channel_facts
 from facediff.export.viewer.packing import (
     CHUNK_FRAMES,
     STEP,
@@ -34,7 +33,7 @@ from facediff.export.viewer.packing import (
     pack_mesh,
     pack_motion,
 )
-from facediff.export.viewer.posing import acted_curves, moods, pose_fields, sounds
+from facediff.export.viewer.posing import acted_curves, channel_facts, moods, pose_fields, sounds
 from facediff.registry import export_format
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.files import atomic, check_writable
@@ -192,8 +191,8 @@ def _animation_facts(animation: Animation, compared: bool, blobs: Blobs) -> dict
     def number(array: npt.ArrayLike | None, kind: str) -> int | None:
         return None if array is None or not np.size(array) else blobs.add(np.asarray(array).astype(kind).tobytes())
 
-    centre, extent = bounds(animation)
     template = np.asarray(animation.template, np.float64) * millimetres(animation)
+    centre, extent = bounds(template, animation.triangles)
     made_with = direction.direction_of(animation)
     regions = animation.regions
     # How much each vertex belongs to each region, in 255ths, for the preview of expressiveness.

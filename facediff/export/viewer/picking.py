@@ -113,21 +113,10 @@ def picking_page(picking: Picking) -> Iterator[str]:
     suggested = (
         landmarks_by_shape(laid, faces, target_features) if target_features is not None and of_target is None else {}
     )
-    blobs = Blobs()
-    animations = [
-        Animation(
-            name,
-            points.astype(np.float32)[None],
-            points.astype(np.float32),
-            25.0,
-            faces=triangles.astype(np.int32),
-            unit=source.unit,
-            colours=colours,
-        )
-        for name, points, triangles, colours in (
-            (picking.names[0], rest, goal.faces, source.colours),
-            (picking.names[1], laid, moved.faces, target.colours),
-        )
+    blobs, scale = Blobs(), millimetres(source)
+    sides = [
+        (picking.names[0], rest, goal.faces, source.colours, features),
+        (picking.names[1], laid, moved.faces, target.colours, None if target_features is None else features),
     ]
     facts: dict[str, Any] = {
         "format": FORMAT,
@@ -136,15 +125,7 @@ def picking_page(picking: Picking) -> Iterator[str]:
         "known": {"source": source_landmarks.vertices, "target": {} if of_target is None else of_target.vertices},
         "suggested": suggested,
         "start": [] if picking.start is None else as_rows(picking.start),
-        "sides": {
-            side: _side(animation, side_features, blobs)
-            for side, animation, side_features in zip(
-                ("source", "target"),
-                animations,
-                (features, features if target_features is not None else None),
-                strict=True,
-            )
-        },
+        "sides": dict(zip(("source", "target"), [_side(*side, scale, blobs) for side in sides], strict=True)),
     }
     facts["sides"]["target"]["parts"] = _runs(picking.parts)
     return assemble(
@@ -187,11 +168,18 @@ ABOUT = 1.5, 1.9, 0.55
 mouth."""
 
 
-def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict[str, Any]:
+def _side(
+    name: str,
+    rest: Array,
+    triangles: npt.NDArray[np.int64],
+    colours: npt.NDArray[np.uint8] | None,
+    features: Features | None,
+    scale: float,
+    blobs: Blobs,
+) -> dict[str, Any]:
     """One mesh, laid like the source, in mm; all of it is shown where no face was found."""
-    scale = millimetres(animation)
-    points = np.asarray(animation.template, np.float64) * scale
-    whole_centre, whole_extent = bounds(animation)
+    points = rest.astype(np.float32).astype(np.float64) * scale
+    whole_centre, whole_extent = bounds(points, triangles)
     centre, extent = whole_centre, whole_extent
     about = points
     if features is not None:
@@ -202,9 +190,9 @@ def _side(animation: Animation, features: Features | None, blobs: Blobs) -> dict
     about = about if len(about) >= 20 else points
     plane = symmetry_plane(about, Plane(np.array([1.0, 0.0, 0.0]), centre[0]))
     return {
-        "name": animation.name,
+        "name": name,
         "vertices": len(points),
-        **pack_mesh(points, animation.triangles, animation.colours, blobs),
+        **pack_mesh(points, triangles, colours, blobs),
         "centre": centre,
         "extent": extent,
         "whole": {"centre": whole_centre, "extent": whole_extent},

@@ -19,8 +19,8 @@ values                  61 × 4      floats: 52 weights from 0 to 1, yaw, pitch 
 from __future__ import annotations
 
 import struct
-import time
 import uuid
+from datetime import datetime
 from fractions import Fraction
 
 import numpy as np
@@ -93,6 +93,5 @@ class LiveLink(UdpReceiver):
 
 def seconds_of_day() -> float:
     """Seconds since midnight by this machine's clock, in its time zone."""
-    timestamp = time.time()
-    local = time.localtime(timestamp)
-    return local.tm_hour * 3600 + local.tm_min * 60 + local.tm_sec + timestamp % 1
+    now = datetime.now()  # noqa: DTZ005 - the zone of this machine
+    return (now - now.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
