@@ -46,20 +46,13 @@ MOTION = "facediff.pipelines.motion"  # What shows, changes and writes animation
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Channels of a parametric space that an animation's vertices were made of.
-
-    Attributes:
-        space: their meaning.
-        values: (T, C) float32, finite.
-        vertices: the animation's array of vertices. A change of the vertices makes another array, which the
-            channels do not belong to.
-        deltas: (K, V, 3) float32, what each channel of :attr:`Space.face` moves the vertices by at 1, the head aside;
-            None if the vertices are no weighted sum.
-    """
+    """Channels of a parametric space that an animation's vertices were made of."""
 
     space: Space
-    values: npt.NDArray[np.float32]
+    values: npt.NDArray[np.float32]  # (T, C)
+    # The animation's array: a change of the vertices makes another one, which the channels do not belong to.
     vertices: npt.NDArray[np.float32]
+    # (K, V, 3): by what each channel of Space.face moves the vertices at 1; None if they are no weighted sum
     deltas: npt.NDArray[np.float32] | None = None
 
 

@@ -47,15 +47,10 @@ NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:nan|inf)"
 
 @dataclass(frozen=True)
 class Weighted:
-    """One style of a mixture.
+    """One style of a mixture."""
 
-    Attributes:
-        name: a file or the name of a clip.
-        weight: None if none was given.
-    """
-
-    name: str
-    weight: float | None
+    name: str  # a file or the name of a clip
+    weight: float | None  # None if none was given
 
 
 def split_styles(text: str, clips: Sequence[str] = ()) -> list[Weighted]:
@@ -120,19 +115,11 @@ def normalised(text: str, weights: Sequence[float | None]) -> list[float]:
 
 @dataclass(frozen=True)
 class StyleFile:
-    """A motion or a style vector as read from a file.
-
-    Attributes:
-        path: the file.
-        array: (T, V, 3) or (T, 3V) absolute vertices, or a style vector.
-        template: (V, 3) of an animation, in the motion's unit; None for a bare array.
-        frame_rate: likewise.
-        unit: likewise.
-    """
+    """A motion or a style vector as read from a file."""
 
     path: Path
-    array: npt.NDArray[np.generic]
-    template: Array | None = None
+    array: npt.NDArray[np.generic]  # (T, V, 3) or (T, 3V) absolute vertices, or a style vector
+    template: Array | None = None  # (V, 3) of an animation, in the motion's unit; None for a bare array
     frame_rate: float | None = None
     unit: str | None = None
 

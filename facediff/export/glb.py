@@ -89,13 +89,8 @@ def named_shapes(
 def weighted_shapes(animation: Animation, space: FileSpace, tolerance: float) -> tuple[Array, Morphs] | None:
     """The weights of ARKit's shapes that an animation was made of, and the face (V, 3) where all are 0.
 
-    Args:
-        animation: with a head that does not move.
-        space: of the file.
-        tolerance: largest distance of a vertex, in the unit of the file.
-
-    Returns:
-        None if there are no weights, or vertices that are not their sum.
+    None if there are no weights, or vertices that are further from their sum than the tolerance, in the unit of the
+    file. The animation's head does not move.
     """
     values, deltas = animation.values, animation.deltas
     if values is None or deltas is None or animation.space.kind != "arkit":
@@ -116,11 +111,7 @@ def weighted_shapes(animation: Animation, space: FileSpace, tolerance: float) ->
 def shapes_of_motion(animation: Animation, space: FileSpace, rest: Array, tolerance: float) -> Morphs:
     """As few shapes as keep every vertex of every frame within a distance of the original, see :func:`compress`.
 
-    Args:
-        animation: with a head that does not move.
-        space: of the file.
-        rest: (V, 3) the face at rest in it.
-        tolerance: largest distance of a vertex, in the unit of the file.
+    The animation's head does not move; the face at rest (V, 3) and the tolerance are in the unit of the file.
     """
     if len(animation.vertices) * rest.nbytes > LONG_BYTES:
 
@@ -280,29 +271,18 @@ def add_materials(document: GlbWriter, surface: Textures) -> None:
 
 @dataclass(frozen=True)
 class MovingNode:
-    """A node that turns or moves: the head, which carries the face, or an eye, which carries nothing.
+    """A node that turns or moves: the head, which carries the face, or an eye, which carries nothing."""
 
-    Attributes:
-        name: ``head``, ``left_eye`` or ``right_eye``.
-        curves: (T, n) values by the path that they change, ``rotation`` x, y, z, w and ``translation`` in metres.
-        translation: (3,) its position; None at the origin.
-    """
-
-    name: str
-    curves: Mapping[str, Array]
-    translation: Array | None = None
+    name: str  # head, left_eye or right_eye
+    curves: Mapping[str, Array]  # (T, n) by the path that they change: rotation x, y, z, w; translation in metres
+    translation: Array | None = None  # (3,) its position; None at the origin
 
 
 def moving_nodes(animation: Animation, space: FileSpace, head: npt.NDArray[np.float64] | None) -> list[MovingNode]:
-    """What turns besides the face.
+    """Nodes that turn besides the face, by the head (T, 6) in the animation's unit and by its channels.
 
     Shapes (``eyeLook…``) move the eyeballs of the one mesh: the eyes' nodes carry the angles that channels say, at the
-    eyeballs' centres where these are known.
-
-    Args:
-        animation: with a head that does not move.
-        space: of the file.
-        head: (T, 6) rotations, axis-angle in radians, and shifts in the animation's unit; None for none.
+    eyeballs' centres where these are known. The animation's head does not move.
     """
     nodes = []
     if head is not None:

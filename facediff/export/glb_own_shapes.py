@@ -67,19 +67,12 @@ class ShapeBinding:
 
 @dataclass(frozen=True)
 class OwnShapes:
-    """The shapes and bones of an avatar that an animation can drive.
+    """The shapes and bones of an avatar that an animation can drive."""
 
-    Attributes:
-        kind: the naming scheme of the mouth's shapes.
-        binds: targets by shape: ARKit's names, visemes, and ``blink`` for both lids.
-        bones: numbers of nodes by the part that they turn.
-        names: names of these nodes.
-    """
-
-    kind: Kind
-    binds: dict[str, list[ShapeBinding]]
-    bones: dict[str, int]
-    names: dict[str, str]
+    kind: Kind  # naming scheme of the mouth's shapes
+    binds: dict[str, list[ShapeBinding]]  # by shape: ARKit's names, visemes, and ``blink`` for both lids
+    bones: dict[str, int]  # numbers of nodes by the part that they turn
+    names: dict[str, str]  # of these nodes
 
     @property
     def summary(self) -> str:

@@ -97,7 +97,6 @@ def heat(values_mm: npt.NDArray[np.floating], label: str) -> tuple[str, npt.NDAr
 def _draw(
     path: Path,
     panels: Sequence[DrawnFace],
-    size: int = 272,
     *,
     focus: Sequence[npt.NDArray[np.floating]] | None = None,
     columns: int | None = None,
@@ -108,7 +107,7 @@ def _draw(
         Renderer(
             panel.faces,
             template=panel.vertices,
-            size=size,
+            size=272,
             camera=camera if panel.focus is None else Camera.framing(panel.focus),
             colours=panel.colours,
         ).render(panel.vertices)

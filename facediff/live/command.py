@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 from facediff.errors import FaceDiffError, printable
-from facediff.live.frames import OPTION, Performance, Receiver, open_receiver
+from facediff.live.frames import OPTION, Performance, open_receiver
 from facediff.live.loop import LiveSummary, Loop, Solver
 from facediff.live.model import LiveModel
 from facediff.live.options import LiveOptions
@@ -42,7 +42,10 @@ def perform(options: LiveOptions, open_model: Callable[[], LiveModel], report: R
         metadata=dict(model.metadata),
     )
     model.warm_up()
-    with opened(receivers, performance):
+    with ExitStack() as stack:
+        for receiver in receivers:
+            stack.callback(receiver.close)
+            receiver.open(performance)
         if not options.quiet:
             report(
                 f"ready; {source.name}; {model.frame_rate:g} frames a second, each {model.lag:.2f} s after its speech "
@@ -72,20 +75,6 @@ def solver(shapes: Path, model: LiveModel) -> tuple[tuple[str, ...], Solver]:
     shape_set = read_shapes(shapes, model.neutral, model.unit)
     frame_solver = FrameSolver(shape_set, model.frame_rate, faces=model.faces if len(model.faces) else None, regions={})
     return shape_set.names, lambda offsets: frame_solver.solve(offsets).astype("float32")
-
-
-@contextmanager
-def opened(receivers: Sequence[Receiver], performance: Performance) -> Iterator[None]:
-    """Receivers that are open for as long as the context lasts, and all closed after it."""
-    outputs: list[Receiver] = []
-    try:
-        for opening in receivers:
-            outputs.append(opening)
-            opening.open(performance)
-        yield
-    finally:
-        for closing in reversed(outputs):
-            closing.close()
 
 
 def print_report(sentence: str) -> None:

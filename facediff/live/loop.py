@@ -47,31 +47,18 @@ RECENT = 3.0
 
 @dataclass
 class LiveSummary:
-    """Figures of a performance.
+    """Figures of a performance; seconds but for the counts of frames."""
 
-    Attributes:
-        frames: that were sent.
-        dropped: frames that came too late to be sent, or were left out to give the model time.
-        speech: seconds that were received.
-        lost: seconds of speech that were dropped because the model was too slow.
-        busy: seconds that the model has computed.
-        lag: from the moment that a frame's last sample was spoken until the frame was sent.
-        waiting: of that, from the moment the frame was ready until it was sent.
-        computing: of a window.
-        sending: seconds in which a frame was solved for and given to the receivers.
-        receivers: what each of them reports, by name.
-    """
-
-    frames: int = 0
-    dropped: int = 0
-    speech: float = 0.0
-    lost: float = 0.0
-    busy: float = 0.0
-    lag: Lags = field(default_factory=Lags)
-    waiting: Lags = field(default_factory=Lags)
-    computing: Lags = field(default_factory=Lags)
-    sending: Lags = field(default_factory=Lags)
-    receivers: dict[str, str] = field(default_factory=dict)
+    frames: int = 0  # that were sent
+    dropped: int = 0  # frames that came too late to be sent, or were left out to give the model time
+    speech: float = 0.0  # that was received
+    lost: float = 0.0  # speech that was dropped because the model was too slow
+    busy: float = 0.0  # in which the model has computed
+    lag: Lags = field(default_factory=Lags)  # from a frame's last sample until the frame was sent
+    waiting: Lags = field(default_factory=Lags)  # of that, from the moment the frame was ready
+    computing: Lags = field(default_factory=Lags)  # of a window
+    sending: Lags = field(default_factory=Lags)  # in which a frame was solved for and given to the receivers
+    receivers: dict[str, str] = field(default_factory=dict)  # the reports of each of them, by name
 
     @property
     def factor(self) -> float:
@@ -89,22 +76,12 @@ class LiveSummary:
 
 
 def dropped_text(frames: int, speech: float) -> str:
-    """A sentence about dropped speech and frames, for the run and its end.
-
-    Args:
-        frames: that came too late to be sent, or were left out.
-        speech: seconds that were never animated.
-    """
+    """A sentence about dropped frames, and seconds of speech, for the run and its end."""
     return f"{counted(frames, 'frame')} dropped" + (f", {speech:.1f} s of speech" if speech else "")
 
 
 class Backlog:
-    """Speech that waits for the model; the excess is dropped at its oldest end, in whole frames.
-
-    Args:
-        frame_rate: of the motion.
-        limit: seconds of speech that may wait.
-    """
+    """Speech that waits for the model, ``limit`` seconds at most; the oldest is dropped beyond that, in whole frames."""
 
     def __init__(self, frame_rate: float, limit: float) -> None:
         self.frame_rate = frame_rate

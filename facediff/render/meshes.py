@@ -48,15 +48,7 @@ def is_open(faces: Faces) -> bool:
 
 
 class VertexSums:
-    """Adds values of triangles at their vertices; made once per topology, for many frames.
-
-    Args:
-        faces: triangles (F, 3).
-        n_vertices: number of vertices.
-
-    Attributes:
-        counts: how many triangles each vertex has (V, 1); 1 where there is none.
-    """
+    """Adds values of triangles (F, 3) at their vertices; made once per topology, for many frames."""
 
     def __init__(self, faces: Faces, n_vertices: int) -> None:
         corners = faces.ravel()

@@ -19,20 +19,10 @@ MOST_ROUNDS = 6
 class Refinement:
     """Splits long edges in the middle, again and again; the surface stays where it is.
 
-    Light is computed per vertex and interpolated over triangles, which shows facets where triangles are large and
-    none where they are small. Edges to split are chosen once, on the template: an edge belongs to all its triangles, so
-    that no gap opens between them, and frames differ by motion only.
-
-    Args:
-        faces: triangles (F, 3).
-        template: positions (V, 3).
-        longest: edges of the template that are longer are split, in the template's unit.
-        normals: unit normals (V, 3); where they differ by `SHARP` along an edge, half that length is too long.
-        shortest: edges that are not longer than this are never split.
-
-    Attributes:
-        faces: the finer triangles, wound like those that they lie in.
-        n_vertices: number of the template's vertices and of those that were added.
+    Light is computed per vertex and interpolated over triangles, which shows facets where triangles are large and none
+    where they are small. Edges to split are chosen once, on the template (V, 3): those above ``longest``, or half of it
+    where unit normals (V, 3) differ by `SHARP` along them, and above ``shortest``. An edge belongs to all its
+    triangles, so that no gap opens between them, and frames differ by motion only.
 
     Example:
         >>> finer = Refinement(np.array([[0, 1, 2]]), np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), longest=1.2)

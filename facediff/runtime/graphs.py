@@ -23,14 +23,7 @@ Array = npt.NDArray[np.float32]
 class ExportedGraphs:
     """Content of a folder of ``facediff export-model``, ready to run.
 
-    Args:
-        description: of the folder.
-        arrays: of the folder.
-        load: opens a graph by its name.
-
     Attributes:
-        description: content of ``model.json``.
-        arrays: content of ``arrays.npz``.
         clock: how the model counts its frames.
         loop: each step with its row of the sampler's table.
     """
@@ -100,13 +93,7 @@ class ExportedGraphs:
 def open_session(
     path: Path, *, threads: int = 0, providers: Sequence[str] | None = None
 ) -> onnxruntime.InferenceSession:
-    """Open a graph, once :func:`~facediff.runtime.graph_check.check_graph` has read it.
-
-    Args:
-        path: the graph.
-        threads: of the processor; as many as it has cores if 0.
-        providers: what computes, by ONNX Runtime's names; the processor if None.
-    """
+    """Open a graph that :func:`~facediff.runtime.graph_check.check_graph` lets pass; as :meth:`ExportedGraphs.open`."""
     import onnxruntime
 
     check_graph(path)
@@ -129,14 +116,7 @@ def run_session(
     source: str,
     outputs: Sequence[str] | None = None,
 ) -> list[Array]:
-    """Results of a graph.
-
-    Args:
-        session: the graph.
-        inputs: those that it declares.
-        source: the graph, for messages.
-        outputs: names of the results; all in the graph's order if None.
-    """
+    """Results of a graph, by the names of its outputs or all in its order; ``source`` is the graph in messages."""
     import onnxruntime
 
     options = onnxruntime.RunOptions()

@@ -36,11 +36,6 @@ Array = npt.NDArray[np.float32]
 class RuntimeModel(ExportedGraphs):
     """A model that ``facediff export-model`` wrote; :meth:`open` reads its folder.
 
-    Args:
-        description: of the folder.
-        arrays: of the folder.
-        load: opens a graph by its name.
-
     Attributes:
         windows: how long speech is cut; may be changed at any time.
     """
@@ -217,12 +212,6 @@ class RuntimeStream(SpeechWindows[Array]):
 
     :meth:`feed` and :meth:`finish` give absolute points (frames, points, dims), as the model moves them: vertices, or
     the channels of its space.
-
-    Args:
-        model: the model.
-        face: place of the face among the templates.
-        conditions: what motion is conditioned on.
-        plan: the windows.
     """
 
     def __init__(self, model: RuntimeModel, face: int, conditions: RuntimeConditions, plan: WindowPlan) -> None:

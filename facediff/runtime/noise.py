@@ -73,13 +73,7 @@ def stream_of(name: str, seed: int) -> NormalStream:
 
 
 class NumpyWindowNoise:
-    """Unit noise of a window of long speech, as :class:`facediff.models.inference.WindowNoise` draws it.
-
-    Args:
-        name: of the noise.
-        window: which window.
-        seed: of the clip.
-    """
+    """Unit noise of a window of long speech, as :class:`facediff.models.inference.WindowNoise` draws it."""
 
     def __init__(self, name: str, window: MotionWindow, seed: int) -> None:
         self.name, self.window, self.seed = name, window, seed

