@@ -81,7 +81,7 @@ def dropped_text(frames: int, speech: float) -> str:
 
 
 class Backlog:
-    """Speech that waits for the model, ``limit`` seconds at most; the oldest is dropped beyond that, in whole frames."""
+    """Speech that waits for the model, ``limit`` seconds at most; the oldest is dropped then, in whole frames."""
 
     def __init__(self, frame_rate: float, limit: float) -> None:
         self.frame_rate = frame_rate

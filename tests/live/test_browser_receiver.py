@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import socket
 import struct
@@ -201,18 +200,6 @@ def test_more_pages_than_are_served_are_refused(served: Browser, monkeypatch: py
         wait_for(served, "1 page at")
         with pytest.raises(InvalidStatus), visit(served):
             pass
-
-
-def test_only_reading_is_answered(served: Browser) -> None:
-    for method in ("GET", "HEAD", "PUT", "DELETE", "PATCH", "TRACE", "POST"):
-        connection = http.client.HTTPConnection(served.host, served.port, timeout=PATIENCE)
-        with closing(connection):
-            connection.request(method, "/")
-            response = connection.getresponse()
-            content = response.read()
-        assert response.status == (200 if method in ("GET", "HEAD") else 405)
-        assert (b"<html" in content) == (method == "GET")
-        assert method != "HEAD" or int(response.headers["Content-Length"]) > 10_000
 
 
 def test_two_hundred_visitors_at_the_same_moment_get_the_page(served: Browser) -> None:

@@ -155,13 +155,9 @@ class Browser(Receiver):
         if len(hosts) != 1 or not is_own_page(hosts[0], ",".join(origins) if origins else None, self._hosts):
             self._refuse("a page from elsewhere asked for frames")
             return _response(http.HTTPStatus.FORBIDDEN, b"only the page that this server shows may ask it\n")
-        path, method = request.path.partition("?")[0], getattr(request, "method", "GET")  # websockets 15 reads GET only
-        if method not in ("GET", "HEAD"):
-            return _response(http.HTTPStatus.METHOD_NOT_ALLOWED, b"the page is read with GET\n", Allow="GET, HEAD")
+        path = request.path.partition("?")[0]
         if path == "/":
-            response = _response(http.HTTPStatus.OK, self._page, "text/html; charset=utf-8")
-            response.body = b"" if method == "HEAD" else response.body
-            return response
+            return _response(http.HTTPStatus.OK, self._page, "text/html; charset=utf-8")
         if path != "/live":
             return _response(http.HTTPStatus.NOT_FOUND, b"there is one page, at /\n")
         if len(self._viewers) >= MOST_VIEWERS:
@@ -314,14 +310,12 @@ class _Viewer:
             outbox.close(0.2)
 
 
-def _response(status: http.HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8", **more: str) -> Response:
+def _response(status: http.HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> Response:
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
     headers = Headers([*HEADERS.items(), ("Content-Type", kind), ("Content-Length", str(len(body)))])
-    headers["Cache-Control"] = "no-store"
-    headers["Connection"] = "close"
-    headers.update(more)
+    headers.update({"Cache-Control": "no-store", "Connection": "close"})
     return Response(status.value, status.phrase, headers, body)
 
 
@@ -331,15 +325,13 @@ def _head(kind: int, first: int, second: int, part: float, seconds: float) -> by
 
 def _mesh(performance: Performance, scale: float) -> bytes:
     """The message with the face at rest in mm, its triangles counter-clockwise seen from outside."""
-    from facediff.animation import Animation
-    from facediff.export.format import outward
+    from facediff.render.meshes import face_outward
 
-    neutral = performance.neutral.astype(np.float32)
-    face = Animation(performance.subject, neutral[None], neutral, performance.frame_rate, faces=performance.faces)
-    triangles = outward(face).astype("<u4")
+    neutral = performance.neutral.astype(np.float64)
+    triangles = face_outward(performance.faces, neutral).astype("<u4")
     colours = b"" if performance.colours is None else performance.colours.astype(np.uint8).tobytes()
     head = struct.pack("<B3xIII8x", MESH, len(neutral), len(triangles), int(bool(colours)))
-    return head + (neutral.astype(np.float64) * scale).astype("<f4").tobytes() + triangles.tobytes() + colours
+    return head + (neutral * scale).astype("<f4").tobytes() + triangles.tobytes() + colours
 
 
 def page(subject: str) -> Iterator[str]:
