@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -122,26 +120,6 @@ def test_archive_is_never_written_with_motion_that_is_not_finite(animation: Anim
 )
 def test_metres_per_unit(unit: str, metres: float) -> None:
     assert metres_per_unit(unit) == pytest.approx(metres)
-
-
-def test_frames_larger_than_memory_are_read_without_holding_them(tmp_path: Path) -> None:
-    """In a process of its own, since memory is counted per process: 600 MB are looked at twice."""
-    made = np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.float32, (2500, 20_000, 3))
-    made[2499, 0, 0] = 1
-    del made
-    program = f"""
-import resource, numpy as np
-from facediff.animation import Animation
-from facediff.utils.arrays import open_vertices
-vertices = open_vertices(__import__("pathlib").Path({str(tmp_path / "large.npy")!r}))
-animation = Animation("large", vertices, np.zeros((20_000, 3), np.float32), 25.0)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-animation.refuse_not_finite()
-assert sum(float(frame[0, 0]) for frame in animation.frames()) == 1
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert float(done.stdout) < 200
 
 
 def test_motion_in_a_file_is_read_and_written_as_an_array(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -200,15 +200,6 @@ def test_speech_next_to_an_export_is_readable_everywhere(animation: Animation, t
     np.testing.assert_array_equal(values / np.float32(32768), animation.speech)
 
 
-def test_page_holds_all_animations(animation: Animation, tmp_path: Path) -> None:
-    path = tmp_path / "a.html"
-    assert write_animations(path, [animation, animation]) == [path]
-    assert path.read_text(encoding="utf-8").lstrip().lower().startswith("<!doctype html>")
-    silent = tmp_path / "b.html"
-    write_animations(silent, [animation, animation], ExportOptions(no_speech=True))
-    assert silent.stat().st_size < path.stat().st_size
-
-
 def test_csv_holds_weights_solved_for_the_shapes(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     rest = make_animation().template
     rng = np.random.default_rng(3)

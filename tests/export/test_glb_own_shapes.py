@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from facediff.animation import Animation, write_archive
-from facediff.cli.app import main
-from facediff.editing.controls.procedural import move_head
+from facediff.animation import Animation
 from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.export.glb_own_shapes import drive_avatar, own_shapes
@@ -337,26 +335,3 @@ def test_bones_of_vrms_older_version_turn_about_a_face_that_looks_back(
 def posed_at_rest(path: Path) -> dict[str, np.ndarray]:
     glb = opened(path)
     return {glb.content["nodes"][part.node]["name"]: part.points for part in placed_parts(glb)}
-
-
-@pytest.mark.slow
-def test_a_figures_head_turns_by_its_bone_where_shapes_are_solved_for(
-    tmp_path: Path, parts: dict[str, AvatarPart]
-) -> None:
-    """The body, which has no shape that sways, would else take the weights with it."""
-    write_avatar(tmp_path / "avatar.glb", parts)
-    rest, opening = parts["Head"].vertices - [0, 1.6, 0], np.clip(np.sin(np.arange(FRAMES) / 5), 0, 0.8)
-    vertices = rest + opening[:, None, None] * parts["Head"].targets["jawOpen"]
-    talk = Animation("talk", vertices.astype("f4"), rest.astype("f4"), 25.0, faces=parts["Head"].faces.astype("i4"))
-    turns = 0.1 * np.sin(np.outer(np.arange(FRAMES) / 5, [1, 2, 1]))
-    rows = []
-    for shown in (talk, move_head(talk, turns, 0.02 * turns)):
-        write_archive(tmp_path / "talk.npz", shown)
-        words = ["--target-mesh", str(tmp_path / "avatar.glb"), "--correspondence", str(tmp_path / "map.npz")]
-        words += ["--accept-poor", "-o", str(tmp_path / "out.glb")]
-        assert main(["retarget", str(tmp_path / "talk.npz"), *words]) == 0
-        rows.append((moving := tracks(opened(tmp_path / "out.glb")))["Head", "weights"])
-    assert ("HeadJoint", "rotation") in moving
-    jaw = rows[0][:, list(parts["Head"].targets).index("jawOpen")]
-    assert np.abs(jaw - opening).max() < 0.15
-    assert np.abs(rows[1] - rows[0]).max() < 1e-3

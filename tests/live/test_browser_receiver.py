@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import socket
 import struct
-import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import replace
 
@@ -200,17 +198,3 @@ def test_more_pages_than_are_served_are_refused(served: Browser, monkeypatch: py
         wait_for(served, "1 page at")
         with pytest.raises(InvalidStatus), visit(served):
             pass
-
-
-def test_two_hundred_visitors_at_the_same_moment_get_the_page(served: Browser) -> None:
-    together = threading.Barrier(200)
-
-    def read() -> int:
-        together.wait(PATIENCE)
-        with urllib.request.urlopen(served.url, timeout=PATIENCE) as response:  # noqa: S310 - our own server
-            return len(response.read())
-
-    with ThreadPoolExecutor(200) as pool:
-        lengths = [future.result() for future in [pool.submit(read) for _ in range(200)]]
-    assert len(set(lengths)) == 1
-    assert lengths[0] > 10_000

@@ -7,9 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from facediff.render import Renderer, panels, side_by_side
+from facediff.render import Renderer, panels, rasteriser, side_by_side
 from facediff.render.refinement import Refinement
-from tests.fakes.light_per_sample import PerSampleRenderer
 from tests.fakes.small_face import CONTROLS, Shape, build_face, build_rig
 
 
@@ -21,22 +20,19 @@ def talking() -> npt.NDArray[np.float64]:
     return np.asarray(build_rig(Shape()).pose(weights))
 
 
-@pytest.mark.parametrize("coloured", [True, False])
-@pytest.mark.parametrize("view", ["front", "three_quarter"])
 @pytest.mark.slow
-def test_light_per_vertex_looks_like_light_per_sample(
-    coloured: bool, view: str, talking: npt.NDArray[np.float64]
+def test_light_per_vertex_looks_like_light_of_a_far_finer_mesh(
+    talking: npt.NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    face = build_face()
-    colours = face.colours if coloured else None
-    for size in (512, 128):
-        drawn, expected = (
-            kind(face.faces, template=talking[0], size=size, view=view, colours=colours).render(talking[3])
-            for kind in (Renderer, PerSampleRenderer)
-        )
-        error = drawn.astype(np.float64) - expected
-        assert 10 * np.log10(255**2 / np.mean(error**2)) > (52 if size == 512 else 48)
-        assert abs(error.mean()) < 0.1
+    face, pictures = build_face(), []
+    for finer in (1, 8):
+        monkeypatch.setattr(rasteriser, "EDGE", rasteriser.EDGE / finer)
+        monkeypatch.setattr(rasteriser, "SHORTEST_EDGE", rasteriser.SHORTEST_EDGE / finer)
+        renderer = Renderer(face.faces, template=talking[0], size=256, colours=face.colours)
+        pictures.append(renderer.render(talking[3]).astype(np.float64))
+    error = pictures[0] - pictures[1]
+    assert 10 * np.log10(255**2 / np.mean(error**2)) > 48
+    assert abs(error.mean()) < 0.1
 
 
 def test_refinement_keeps_surface_winding_and_neighbours() -> None:
@@ -88,7 +84,7 @@ def test_threads_draw_the_same_pictures_in_order(
     renderer = Renderer(face.faces, template=talking[0], size=96, colours=face.colours)
     alone = np.stack([renderer.render(frame) for frame in motion])
     for threads in (1, 3):
-        monkeypatch.setattr(panels, "drawing_threads", lambda threads=threads: threads)
+        monkeypatch.setattr(panels, "processors", lambda threads=threads: threads)
         drawn = np.stack(list(side_by_side(renderer, [motion], [""])))
         np.testing.assert_array_equal(drawn, alone)
 
@@ -96,7 +92,7 @@ def test_threads_draw_the_same_pictures_in_order(
 def test_pictures_that_nobody_takes_are_not_drawn(
     talking: npt.NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(panels, "drawing_threads", lambda: 2)
+    monkeypatch.setattr(panels, "processors", lambda: 2)
     started: list[int] = []
     render = Renderer.render
 

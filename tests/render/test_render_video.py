@@ -35,13 +35,14 @@ def _read_sound(path: Path) -> tuple[npt.NDArray[np.float32], int, float]:
 @pytest.mark.parametrize("count", [1, 2, 37])
 def test_video_frame_count_and_rate_are_exact(tmp_path: Path, rate: float, count: int) -> None:
     path = tmp_path / "a.mp4"
-    assert write_video(path, _frames(count), rate, np.zeros(8000, np.float32), SAMPLE_RATE) == count
+    assert write_video(path, _frames(count, (47, 63)), rate, np.zeros(8000, np.float32), SAMPLE_RATE) == count
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert sum(1 for _ in container.decode(video=0)) == count
         if count > 1:
             assert stream.average_rate == Fraction(rate).limit_denominator(1001)
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.height, stream.width) == (48, 64)  # as H.264 requires
         assert container.streams.audio[0].codec_context.name == "aac"
     capture = cv2.VideoCapture(str(path))
     seen = 0
@@ -127,20 +128,6 @@ def test_video_mouth_opens_with_its_clicks(tmp_path: Path) -> None:
     (offsets,) = _boxes(path.read_bytes(), b"moov", b"trak", b"mdia", b"minf", b"stbl", b"ctts")
     assert edits[0][3] == struct.unpack_from(">I", offsets, 12)[0]  # the first picture's delay by re-ordering
     assert edits[1][3] == 1024  # AAC's priming, in samples
-
-
-def test_a_webm_holds_vp9_and_opus_and_its_pictures_are_equal_when_written_twice(tmp_path: Path) -> None:
-    sound = np.zeros(SAMPLE_RATE + 77, np.float32)
-    packets = []
-    for name in ("a.webm", "b.webm"):
-        assert write_video(tmp_path / name, _frames(31, (33, 48)), 29.97, sound, 44_100) == 31
-        with av.open(str(tmp_path / name)) as container:
-            video, audio = container.streams.video[0], container.streams.audio[0]
-            assert (video.codec_context.name, audio.codec_context.name) == ("vp9", "opus")
-            assert (video.height, video.width) == (34, 48)
-            packets.append([bytes(packet) for packet in container.demux(video=0)])
-    assert packets[0] == packets[1]
-    assert sum(bool(packet) for packet in packets[0]) == 31
 
 
 def test_video_is_equal_when_written_twice(tmp_path: Path) -> None:

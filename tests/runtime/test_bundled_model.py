@@ -155,17 +155,3 @@ def test_it_is_written_as_a_folder_and_listed(tmp_path: Path, capsys: pytest.Cap
     assert [row["name"] for row in rows if row["kind"] == "bundled_model"] == ["puppet"]
     assert main(["components", "model"]) == 0
     assert "bundled_model:" in capsys.readouterr().out
-
-
-def test_without_it_a_checkpoint_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(hub, "BUNDLED", tmp_path / "none")
-    with pytest.raises(FaceDiffError, match="--checkpoint: missing"):
-        facediff.load()
-    animate = ["animate", str(SPEECH), "-o", str(tmp_path / "x.npy")]
-    for words in (animate, ["live", "--to", "keep:1", "--microphone"], ["serve"]):
-        assert main(words) == 2
-        [line] = capsys.readouterr().err.splitlines()
-        assert "--checkpoint: missing" in line
-    assert not (tmp_path / "x.npy").exists()

@@ -12,7 +12,6 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -28,10 +27,9 @@ from facediff.errors import FaceDiffError, OptionError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
 from facediff.models.inference import ClipNoise as ModelNoise
-from facediff.models.inference import Style
 from facediff.models.inference import WindowNoise as ModelWindowNoise
 from facediff.models.samplers import DdimSampler, DdpmSampler, DpmSolverSampler, NoiseProcess, Sampler
-from facediff.pipelines.export_model import Precision, compare, export_model, store_weights
+from facediff.pipelines.export_model import Precision, export_model, store_weights
 from facediff.pipelines.exported import ExportedPipeline
 from facediff.runtime import RuntimeModel
 from facediff.runtime.noise import NormalStream, NumpyWindowNoise, stream_of
@@ -304,26 +302,6 @@ def test_other_parts_are_exported_too(tiny_root: Path, tmp_path: Path, options: 
 
 
 @pytest.mark.slow
-def test_hubert_is_exported_too(tiny_root: Path, tmp_path: Path, hubert_source: Path) -> None:
-    made = ready(tiny_root, audio_encoder=partial(registry.audio_encoder.hubert, source=str(hubert_source)))
-    description = export_model(made, tmp_path / "out")
-    assert description.check["share_of_range"] < 1e-4
-    assert description.equal_lengths
-
-
-def test_a_folder_with_further_styles_alone_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    still, own, used = np.zeros((2, 3, 3), np.float32), Style("happy", torch.zeros(2)), []
-    model, runtime = MagicMock(device=CPU), MagicMock()
-    model.default_style.side_effect = FaceDiffError("no reference motion")
-    model.animate.side_effect = lambda *_, style, **__: used.append(style) or Mock(vertices=torch.zeros(2, 3, 3))
-    runtime.description = Mock(faces=["A"], styles=["happy"], style_source="reference")
-    runtime.motion.return_value = runtime.stream.return_value.conditions.template = still
-    monkeypatch.setattr(RuntimeModel, "open", lambda _: runtime)
-    assert compare(model, tmp_path, np.zeros(16_000, np.float32), {"happy": own})["largest_difference"] == 0
-    assert used == [own]
-
-
-@pytest.mark.slow
 def test_faces_and_styles_of_some_identities_are_exported(tiny_root: Path, tmp_path: Path) -> None:
     made = ready(tiny_root)
     with pytest.raises(FaceDiffError, match='identities: there is no identity "nobody"'):
@@ -435,28 +413,3 @@ def test_facediff_load_animates_a_folder_as_a_model(folder: Path, tmp_path: Path
         facediff.load(folder, device="cuda")
     with pytest.raises(FaceDiffError, match="expressivity"):
         model.animate(speech, 16_000, expressivity={"lips": 0.5})
-
-
-def test_command_animates_a_folder(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import soundfile
-
-    from facediff.animation import read_animation
-    from facediff.cli.app import main as facediff_main
-
-    soundfile.write(tmp_path / "a.wav", sound(1.0), 16_000, subtype="FLOAT")
-    words = [
-        "animate",
-        str(tmp_path / "a.wav"),
-        "--checkpoint",
-        str(folder),
-        "-o",
-        str(tmp_path / "a.npz"),
-        *("--seed", "3", "--voice-gate", "off"),
-    ]
-    assert facediff_main(words) == 0
-    expected = RuntimeModel.open(folder).animate(sound(1.0), seed=3)
-    found = read_animation(tmp_path / "a.npz")
-    np.testing.assert_array_equal(found.vertices, expected.vertices)
-    assert found.metadata["seed"] == "3"
-    assert facediff_main([*words, "--steps", "3"]) == 2
-    assert "--steps: is fixed in an exported model" in capsys.readouterr().err

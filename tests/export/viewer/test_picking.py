@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import signal
-import subprocess
-import sys
 import time
 import urllib.error
 import urllib.request
@@ -16,10 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 import uvicorn
 
-from facediff.animation import write_archive
 from facediff.editing.landmarks import NAMES, read_landmarks
 from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, picking_page
 from facediff.mesh import Mesh
@@ -148,22 +142,6 @@ def test_other_pages_other_bodies_and_other_paths_are_refused(serve: Serve, pick
         assert response.headers["Server"] is None
     assert names_of("0.0.0.0") is None  # noqa: S104
     assert "10.0.0.7" in (names_of("10.0.0.7") or ())
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_the_command_without_a_file(tmp_path: Path) -> None:
-    write_archive(tmp_path / "talk.npz", talking())
-    trimesh.Trimesh(other_face().vertices, other_face().faces, process=False).export(tmp_path / "face.ply")
-    words = ["retarget", "talk.npz", "--target-mesh", "face.ply", "-o", "out.npz", "--pick"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "facediff", *words], cwd=tmp_path, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert re.match(r"http://127\.0\.0\.1:\d+/ ", process.stdout.readline())
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["face.ply", "talk.npz"]
 
 
 # In a browser.
