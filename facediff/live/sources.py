@@ -126,8 +126,6 @@ class Microphone(SpeechSource):
         self._device, about = find_device(self._sound, device)
         self.rate = round(float(about["default_samplerate"]))
         self.name = f"microphone {about['name']}"
-        self.lost = 0
-        """Blocks that came too fast for PortAudio."""
 
     def run(self, deliver: Deliver, stopped: threading.Event) -> None:
         """Hand over blocks as PortAudio gives them, in its thread."""
@@ -136,7 +134,6 @@ class Microphone(SpeechSource):
         def heard(block: npt.NDArray[np.float32], count: int, clock: Any, status: Any) -> None:  # noqa: ANN401
             timestamp = time.monotonic()
             latest[0] = timestamp
-            self.lost += bool(status)
             # The block was recorded before it is handed over; a driver that does not know when says 0.
             waited = clock.currentTime - clock.inputBufferAdcTime - count / self.rate
             arrived = timestamp - waited if clock.inputBufferAdcTime and 0 < waited < 1 else timestamp

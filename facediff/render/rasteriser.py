@@ -216,6 +216,7 @@ class Renderer:
 VIEWS: dict[str, float] = {"front": 0.0, "three_quarter": -35.0, "side": -90.0}
 """Degrees by which the head turns about the vertical axis; negative turns the face to the key light on the left."""
 
+MARGIN = 0.1  # Share of the picture's half size that stays free on every side
 FIELD_OF_VIEW = math.radians(18.0)  # That of a portrait lens: a wide angle would make the nose look large
 
 
@@ -242,7 +243,6 @@ class Camera:
         *,
         view: str = "front",
         aspect: float = 1.0,
-        margin: float = 0.1,
     ) -> Camera:
         """The camera that shows all of one template, or of several in one unit at equal scale.
 
@@ -250,7 +250,6 @@ class Camera:
             templates: (V, 3), or a list of such arrays of any topologies.
             view: a name in `VIEWS`.
             aspect: width / height of the picture.
-            margin: share of the picture's half size that stays free on every side.
         """
         if isinstance(templates, np.ndarray) and templates.ndim == 2:
             templates = [templates]
@@ -261,7 +260,7 @@ class Camera:
         turned = points @ rotation.T
         middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
         x, y, z = (turned - middle).T
-        half = math.tan(FIELD_OF_VIEW / 2) * (1 - margin)
+        half = math.tan(FIELD_OF_VIEW / 2) * (1 - MARGIN)
         # A point at depth z in front of the centre is seen within the angle if |x| <= half · aspect · (distance - z).
         distance = float(max(np.max(np.abs(x) / (half * aspect) + z), np.max(np.abs(y) / half + z)))
         return cls(

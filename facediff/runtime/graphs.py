@@ -61,10 +61,6 @@ class ExportedGraphs:
         """Motion frames a second."""
         return self.description.frame_rate
 
-    def has(self, graph: str) -> bool:
-        """Whether the folder has such a graph."""
-        return graph in self.description.graphs
-
     def run(self, graph: str, inputs: Mapping[str, npt.NDArray[Any]]) -> list[Array]:
         """Results of a graph in the description's order; inputs that it does not declare are ignored."""
         if graph not in self._sessions:

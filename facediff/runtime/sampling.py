@@ -247,7 +247,9 @@ class SamplerRun:
 
     def _start(self, unit: Array) -> Array:
         """The noisy motion that the loop starts from."""
-        return self.model.run("start", {"noise": unit})[0] if self.model.has("start") else self._coloured(unit)
+        if "start" in self.model.description.graphs:
+            return self.model.run("start", {"noise": unit})[0]
+        return self._coloured(unit)
 
     def _coloured(self, unit: Array) -> Array:
         root = self.model.arrays.get("noise")

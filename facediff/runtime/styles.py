@@ -86,7 +86,7 @@ class ExportedStyles(StyleReader[RuntimeStyle]):
 
     def still_vector(self) -> Array | None:
         """The style vector (S,) of a face that keeps still; None where the folder has no style encoder."""
-        if not self.model.has("style"):
+        if "style" not in self.about.graphs:
             return None
         points = len(self.space.channels) or self.vertices
         return encode_style(self.model, np.zeros((1, points, self.space.dims), np.float32), "still").vector
@@ -106,7 +106,7 @@ class ExportedStyles(StyleReader[RuntimeStyle]):
 
 def encode_style(model: ExportedGraphs, motion: Array, name: str) -> RuntimeStyle:
     """The style of reference motion: offsets (T, points, dims) from rest, at the model's unit and frame rate."""
-    if not model.has("style"):
+    if "style" not in model.description.graphs:
         raise FaceDiffError(
             f"style: the folder has no style encoder, so {model.description.model} takes styles by name alone; "
             f"choose one of {', '.join(model.description.styles[:5])}, or export the model again"

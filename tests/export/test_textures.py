@@ -110,7 +110,8 @@ def test_usd_has_coordinates(tmp_path: Path, source: Path, animation: Animation,
     from pxr import Usd, UsdGeom
 
     assert write_animations(tmp_path / "a.usda", [animation], into=source) == [tmp_path / "a.usda"]
-    mesh = UsdGeom.Mesh(Usd.Stage.Open(str(tmp_path / "a.usda")).GetPrimAtPath("/box/face"))
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/box/face"))
     faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
     st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
     assert st.GetInterpolation() == "faceVarying"

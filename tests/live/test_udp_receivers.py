@@ -166,11 +166,6 @@ def test_a_vmc_frame_is_ready_time_weights_and_apply(opened: Opened, listener: L
     np.testing.assert_allclose([each.params[1] for each in values], weights_of(7), atol=1e-7)
 
 
-def test_vmc_names_may_be_arkits_own(opened: Opened, listener: Listener) -> None:
-    opened(f"vmc://127.0.0.1:{listener.port}?names=arkit").send(frame(0))
-    assert [each.params[0] for each in messages(listener.take(2))[2:-1]] == list(ARKIT)
-
-
 def test_vmc_names_may_be_vrms_vowels_and_blinks(opened: Opened, listener: Listener) -> None:
     opened(f"vmc://127.0.0.1:{listener.port}?names=vrm").send(frame(3))
     values = {each.params[0]: each.params[1] for each in messages(listener.take(1))[2:-1]}

@@ -183,7 +183,7 @@ def test_exported_folder_gives_what_the_model_gives(
     runtime = RuntimeModel.open(tmp_path / "out")
     for seconds, identity in ((0.3, "B"), (4.317, UNSEEN)):
         assert_alike(runtime, model, seconds, identity, seed=5)
-    if runtime.has("style"):
+    if "style" in runtime.description.graphs:
         shape = (33, model.n_vertices, model.dims)
         motion = 0.01 * np.random.default_rng(2).normal(size=shape).astype(np.float32)
         with torch.inference_mode():

@@ -31,7 +31,6 @@ import socket
 import struct
 import sys
 import threading
-import webbrowser
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -75,13 +74,11 @@ class Browser(Receiver):
     Args:
         address: ``browser``, ``browser:PORT`` or ``browser://HOST:PORT``; only this machine reaches the page unless
             another host is named.
-        open: whether the page is opened in this machine's browser.
     """
 
-    def __init__(self, address: Address, *, open: bool = False) -> None:  # noqa: A002 - the word of the address
+    def __init__(self, address: Address) -> None:
         super().__init__(address)
         self.host, self.port = endpoint(address, PORT, listens=True)
-        self._shows = open
         self._server: Server | None = None
         self._viewers: dict[int, _Viewer] = {}
         self._lock = threading.Lock()
@@ -146,8 +143,6 @@ class Browser(Receiver):
         self._thread = threading.Thread(target=self._server.serve_forever, name=f"page of {self.name}", daemon=True)
         self._thread.start()
         print(f"{self.name}: the face is at {self.url}", file=sys.stderr, flush=True)
-        if self._shows:
-            webbrowser.open(self.url)
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request with the page, a refusal, or None where a WebSocket may be opened."""

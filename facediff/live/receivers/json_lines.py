@@ -143,12 +143,7 @@ def _rounded(numbers: np.ndarray) -> list[object]:
 
 def _to_stdout(data: bytes) -> None:
     """Write past Python's buffer: a thread that waits for a full pipe must not hold its lock when the program ends."""
-    try:
-        number = sys.stdout.fileno()
-    except (OSError, ValueError, AttributeError):  # not a real one, as in notebooks
-        sys.stdout.write(data.decode())
-        return
     sys.stdout.flush()
     view = memoryview(data)
     while view:
-        view = view[os.write(number, view) :]
+        view = view[os.write(sys.stdout.fileno(), view) :]

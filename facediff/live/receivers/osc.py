@@ -10,11 +10,11 @@ from __future__ import annotations
 import struct
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 
-from facediff.errors import check_known
-from facediff.live.frames import OPTION, Address, LiveFrame, Performance
+from facediff.live.frames import Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
 from facediff.spaces.arkit import ARKIT, live_link_name
@@ -79,7 +79,6 @@ class _Osc(UdpReceiver):
 
 
 _SPACE = Space("arkit", ARKIT)
-NAMES = ("perfect_sync", "arkit", "vrm")
 
 
 @receiver.register("vmc")
@@ -91,18 +90,16 @@ class Vmc(_Osc):
 
     Args:
         address: ``vmc://HOST:PORT``; this machine's port 39539 by default.
-        names: ``perfect_sync`` for JawOpen …, as avatars with perfect sync name their shapes; ``arkit`` for jawOpen …;
-            ``vrm`` for A, I, U, E, O and blinks, which every VRM avatar has.
+        names: ``perfect_sync`` for JawOpen …, as avatars with perfect sync name their shapes, or ``vrm`` for A, I, U,
+            E, O and blinks, which every VRM avatar has.
     """
 
     default_port = 39_539
 
-    def __init__(self, address: Address, *, names: str = "perfect_sync") -> None:
+    def __init__(self, address: Address, *, names: Literal["perfect_sync", "vrm"] = "perfect_sync") -> None:
         super().__init__(address)
-        check_known(f"{OPTION} {self.name}: names", "choice", [names], NAMES)
         self._vrm = names == "vrm"
-        arkit = [live_link_name(name) for name in ARKIT] if names == "perfect_sync" else ARKIT
-        labels = SETS["vrm"] if self._vrm else arkit
+        labels = SETS["vrm"] if self._vrm else [live_link_name(name) for name in ARKIT]
         # All but the weight, which is the last word.
         self._parts = [message("/VMC/Ext/Blend/Val", name, 0.0)[:-4] for name in labels]
         self._ready, self._apply = message("/VMC/Ext/OK", 1), message("/VMC/Ext/Blend/Apply")

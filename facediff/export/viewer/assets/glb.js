@@ -68,14 +68,14 @@ async function compressed(offsetsOf, frames, size) {
   }
   // A face that never moves still needs something to animate.
   if (!shapes.length) shapes.push([new Float32Array(size), new Float32Array(frames)]);
-  return { shapes, names: shapes.map((_, i) => `shape_${String(i).padStart(4, "0")}`), nodes: [] };
+  return { shapes, names: shapes.map((_, i) => `shape_${String(i).padStart(4, "0")}`) };
 }
 
 /**
  * The parts of a .glb. Args: the face, whose template is that of all weights 0; shapes (3 V, in mm) with their weights
- * (T), their names, and nodes that turn beside the face; frames a second; the name; facts that are written with it.
+ * (T), and their names; frames a second; the name; facts that are written with it.
  */
-async function glb(face, { shapes, names, nodes }, frameRate, name, extras) {
+async function glb(face, { shapes, names }, frameRate, name, extras) {
   const size = face.template.length, frames = shapes[0][1].length;
   const times = Array.from({ length: frames }, (_, frame) => frame / frameRate);
   const views = [], accessors = [], parts = [];
@@ -140,20 +140,6 @@ async function glb(face, { shapes, names, nodes }, frameRate, name, extras) {
     bufferViews: views,
     buffers: [{ byteLength: length }],
   };
-  const [scene] = document.scenes, [motion] = document.animations;
-  const siblings = scene.nodes;
-  for (const { name: joint, place: translation, curves } of nodes) {
-    const node = document.nodes.push({ name: joint, ...(translation && { translation }) }) - 1;
-    if (joint === "head") { // carries all others
-      document.nodes[node].children = siblings;
-      scene.nodes = [node];
-    } else siblings.push(node);
-    for (const [path, values] of Object.entries(curves)) {
-      const output = add(values, path === "rotation" ? "VEC4" : "VEC3");
-      const sampler = motion.samplers.push({ input: motion.samplers[0].input, output, interpolation: "LINEAR" }) - 1;
-      motion.channels.push({ sampler, target: { node, path } });
-    }
-  }
   const text = new TextEncoder().encode(JSON.stringify(document));
   const padding = new Uint8Array(-text.length & 3).fill(32);
   const chunk = text.length + padding.length;

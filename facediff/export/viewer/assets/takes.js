@@ -1,21 +1,5 @@
 // A take as files: the motion as the page holds it, as an archive that facediff and NumPy read, the speech, and the keys.
 
-const readNumbers = async (blob) => new Float32Array(await readBlob(blob));
-
-/** Shapes under the names of a take's own weights, as a .glb has them. */
-async function named(scene, size) {
-  const weights = await readNumbers(scene.weights), count = scene.names.length;
-  const shapes = scene.shapes.map(async (blob, column) => [
-    await readField(blob, scene.step, size / 3),
-    Float32Array.from({ length: weights.length / count }, (_, frame) => weights[frame * count + column]),
-  ]);
-  const nodes = scene.nodes.map(async (node) => {
-    const curves = Object.entries(node.curves).map(async ([path, blob]) => [path, await readNumbers(blob)]);
-    return { ...node, curves: Object.fromEntries(await Promise.all(curves)) };
-  });
-  return { names: scene.names, shapes: await Promise.all(shapes), nodes: await Promise.all(nodes) };
-}
-
 /** The download of takes. */
 class Takes {
   constructor(player) {
@@ -26,15 +10,9 @@ class Takes {
     find("take-motion").addEventListener("click", () => this.motion("npz"));
     find("take-glb").addEventListener("click", () => this.motion("glb"));
     find("take-sound").addEventListener("click", () => this.sound());
-    for (const button of this.tables) button.addEventListener("click", () => this.table(button.dataset.tracks));
     find("take-keys").addEventListener("click", () => player.editor.save(this.number));
     find("taken").addEventListener("change", () => this.choose());
     find("downloads").addEventListener("click", () => this.open());
-  }
-
-  /** Buttons of tables of weights. */
-  get tables() {
-    return find("take-tables").querySelectorAll("button");
   }
 
   get number() {
@@ -49,9 +27,8 @@ class Takes {
     find("takes").showModal();
   }
 
-  /** Another take may have no keys, and no weights. */
+  /** Another take may have no keys. */
   choose() {
-    find("take-tables").hidden = !this.facts.animations[this.number].weighted;
     find("take-keys").disabled = !this.player.editor.directions[this.number].keys.length;
   }
 
@@ -70,13 +47,6 @@ class Takes {
       find("takes-said").textContent = error.message;
     }
     for (const button of buttons) button.disabled = false;
-  }
-
-  /** Download a table of the take's weights, or of visemes. */
-  async table(tracks) {
-    const { name, weighted } = this.facts.animations[this.number];
-    const file = tracks === "arkit" ? fileName(name) : `${fileName(name)}_${tracks}`;
-    download(`${file}.csv`, "text/csv", [await readBlob(weighted.tables[tracks])]);
   }
 
   async sound() {
@@ -130,10 +100,7 @@ class Takes {
   async scene(number) {
     const { facts } = this;
     const face = this.player.faces[number], size = face.template.length;
-    const { name, metadata, weighted } = face.animation;
-    if (weighted?.scene) {
-      return glb({ ...face, template: new Float32Array(await readBlob(weighted.scene.rest)) }, await named(weighted.scene, size), facts.frameRate, name, metadata);
-    }
+    const { name, metadata } = face.animation;
     const offsetsOf = async () => {
       const offsets = new Float32Array(size * facts.frames);
       let at = 0;
