@@ -172,6 +172,7 @@ def read_archive(path: Path) -> Animation:
     if isinstance(about, dict):
         check_format(source, about.get("format"), FORMAT)
     facts = dict(vars(read_record(About, about, source, remedy=remedy, strict=False)))
+    facts["frame_rate"] = float(facts["frame_rate"])
     count = len(np.atleast_1d(arrays["template"]))
     checked = {name: _checked(path, name, array, count) for name, array in arrays.items()}
     regions = {name.removeprefix("region_"): array for name, array in checked.items() if name.startswith("region_")}

@@ -47,9 +47,10 @@ def perform(options: LiveOptions, open_model: Callable[[], LiveModel], report: R
             stack.callback(receiver.close)
             receiver.open(performance)
         if not options.quiet:
+            lag = max(0.0, model.look_ahead - 1 / model.frame_rate)
             report(
-                f"ready; {source.name}; {model.frame_rate:g} frames a second, each {model.lag:.2f} s after its speech "
-                f"and the time that computing takes; Ctrl-C ends it"
+                f"ready; {source.name}; {model.frame_rate:g} frames a second, each {lag:.2f} s after its speech and "
+                f"the time that computing takes; Ctrl-C ends it"
             )
         loop = Loop(
             model,

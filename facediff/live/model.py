@@ -68,11 +68,6 @@ class LiveModel:
         arkit = self.decoder is not None and self.decoder.space.kind == "arkit"
         return self.decoder.space.channels if arkit and self.decoder is not None else ()
 
-    @property
-    def lag(self) -> float:
-        """Seconds from the end of a frame's speech until the frame is certain, but for computing."""
-        return max(0.0, self.look_ahead - 1 / self.frame_rate)
-
     def warm_up(self) -> None:
         """Animate silence for a moment, since the first window after opening a model is slow."""
         stream = self.start()

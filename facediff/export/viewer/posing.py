@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -76,33 +77,27 @@ def acted_curves(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
         return None
     if not curves and blinks is None:
         return None
-
-    def packed(curve: npt.NDArray[np.floating]) -> int:
-        return blobs.add(curve.astype("<f4").tobytes())
-
     return {
-        "acting": {name: packed(curve) for name, curve in curves.items()},
-        "blinks": None if blinks is None else packed(blinks),
+        "acting": {name: blobs.add(curve.astype("<f4").tobytes()) for name, curve in curves.items()},
+        "blinks": None if blinks is None else blobs.add(blinks.astype("<f4").tobytes()),
     }
 
 
 def sounds(animations: Sequence[Animation]) -> list[list[Any]]:
     """Rows of start, end, phoneme and word of the first animation that has them; empty if none has."""
     for animation in animations:
-        try:
+        with suppress(FaceDiffError):  # metadata from elsewhere may say anything
             rows = parse_json(animation.metadata.get(PHONEMES, "[]"), animation.name)
-        except FaceDiffError:  # metadata from elsewhere may say anything
-            continue
-        animation_length = isinstance(rows, list) and all(
-            isinstance(row, list)
-            and len(row) == 4
-            and all(isinstance(seconds, int | float) for seconds in row[:2])
-            and all(isinstance(text, str) for text in row[2:])
-            for row in rows
-        )
-        if animation_length and rows:
-            return rows
+            if rows and isinstance(rows, list) and all(map(_is_sound, rows)):
+                return rows
     return []
+
+
+def _is_sound(row: object) -> bool:
+    match row:
+        case [int() | float(), int() | float(), str(), str()]:
+            return True
+    return False
 
 
 def moods() -> dict[str, list[dict[str, float | str]]]:

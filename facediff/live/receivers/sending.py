@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import socket
 import threading
@@ -18,28 +17,12 @@ from facediff.errors import FaceDiffError, counted
 from facediff.live.frames import OPTION, Address, LiveFrame, Performance, Receiver
 from facediff.spaces.arkit import ARKIT
 from facediff.utils.limits import brief
+from facediff.utils.server import LOOPBACK
 
 Item = TypeVar("Item")
 
 log = logging.getLogger("facediff.live")
 """Failures that do not end a performance; without a handler, Python writes them to standard error."""
-
-THIS_MACHINE = "127.0.0.1"
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host is this machine itself, which no other machine can reach.
-
-    Example:
-        >>> [is_loopback(host) for host in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.0.7")]
-        [True, True, True, False, False]
-    """
-    if host.lower() == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def endpoint(address: Address, default_port: int, *, listens: bool = False) -> tuple[str, int]:
@@ -48,8 +31,8 @@ def endpoint(address: Address, default_port: int, *, listens: bool = False) -> t
         raise FaceDiffError(
             f"{OPTION} {address.text}: has no path; expected {address.scheme}://HOST:PORT with options as ?name=value"
         )
-    host, port = address.host or THIS_MACHINE, address.port or default_port
-    if not is_loopback(host):
+    host, port = address.host or LOOPBACK[0], address.port or default_port
+    if host.lower() not in LOOPBACK:
         consequence = "other machines can read the frames there" if listens else "frames leave this machine"
         log.warning("%s: %s, unencrypted", address.text, consequence)
     return host, port
