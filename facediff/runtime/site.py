@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from facediff.animation import metres_per_unit
+from facediff.animation import Animation
 from facediff.animation.archives import FORMAT as ARCHIVE
 from facediff.errors import FaceDiffError
-from facediff.export.viewer.packing import Blobs, pack_mesh
+from facediff.export.format import outward
+from facediff.export.viewer.packing import Blobs, millimetres, pack_mesh
 from facediff.export.viewer.page import assemble, script_of
-from facediff.render.meshes import face_outward
 from facediff.runtime.folder import ARRAYS, DESCRIPTION, Arrays, Description, read_folder
 from facediff.runtime.graph_check import check_graph
 from facediff.speech.audio import read_recording
@@ -131,13 +131,13 @@ def page(title: str, description: Description, arrays: Arrays, recordings: Seque
     if colours is not None and colours.ndim == 3:
         colours = colours[number]
     triangles = arrays["faces"].astype(np.int32)
-    millimetres = 1000 * metres_per_unit(description.unit)
-    mesh = pack_mesh(millimetres * template, face_outward(triangles, template.astype(np.float64)), colours, blobs)
+    face = Animation(title, template[None], template, description.frame_rate, faces=triangles, unit=description.unit)
+    mesh = pack_mesh(millimetres(face) * template, outward(face), colours, blobs)
     facts: dict[str, Any] = {
         "format": FORMAT,
         "archive": ARCHIVE,
         "checkpoint": title,
-        "millimetres": millimetres,
+        "millimetres": millimetres(face),
         "face": {**mesh, "name": name, "frameRate": description.frame_rate},
         "delays": DELAYS,
         "recordings": recordings,

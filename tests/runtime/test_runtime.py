@@ -269,7 +269,7 @@ def test_a_bare_motion_is_completed_by_a_folder(folder: Path, tmp_path: Path) ->
         [*({*exported.model.description.faces} - {*exported.identities})],
     )
     keys = [{"time": 0, "channel": "style", "value": "A"}]
-    with pytest.raises(FaceDiffError, match="needs a checkpoint"):
+    with pytest.raises(FaceDiffError, match="needs the model itself"):
         exported.animate(sound(0.5), 16_000, direction=keys)
 
 

@@ -320,13 +320,15 @@ def _head(kind: int, first: int, second: int, part: float, seconds: float) -> by
 
 def _mesh(performance: Performance, scale: float) -> bytes:
     """The message with the face at rest in mm, its triangles counter-clockwise seen from outside."""
-    from facediff.render.meshes import face_outward
+    from facediff.animation import Animation
+    from facediff.export.format import outward
 
-    neutral = performance.neutral.astype(np.float64)
-    triangles = face_outward(performance.faces, neutral).astype("<u4")
+    neutral = performance.neutral.astype(np.float32)
+    face = Animation(performance.subject, neutral[None], neutral, performance.frame_rate, faces=performance.faces)
+    triangles = outward(face).astype("<u4")
     colours = b"" if performance.colours is None else performance.colours.astype(np.uint8).tobytes()
     head = struct.pack("<B3xIII8x", MESH, len(neutral), len(triangles), int(bool(colours)))
-    return head + (neutral * scale).astype("<f4").tobytes() + triangles.tobytes() + colours
+    return head + (neutral.astype(np.float64) * scale).astype("<f4").tobytes() + triangles.tobytes() + colours
 
 
 def page(subject: str) -> Iterator[str]:
