@@ -9,7 +9,7 @@ import re
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from facediff import registry
 from facediff.data.corpus import Clip
@@ -111,8 +111,6 @@ class Beat(ParametricDataModule):
     Args:
         root: the folder.
         conversations: use recordings of conversations (types 1, 3, 5, 7) as well as of speeches (0, 2, 4, 6).
-        split: ``order`` as in every folder of recordings, or ``official``, BEAT's own by the recordings' numbers
-            (:func:`official_split`), which is of English only.
         options: as for every data module.
     """
 
@@ -128,17 +126,9 @@ class Beat(ParametricDataModule):
     licence_source: ClassVar[str] = "pantomatrix.github.io/BEAT"
     obtain: ClassVar[str] = "BEAT is distributed at pantomatrix.github.io/BEAT; put its .json and .wav files into it."
 
-    def __init__(
-        self,
-        *,
-        root: str,
-        conversations: bool = False,
-        split: Literal["order", "official"] = "order",
-        **options: Any,  # noqa: ANN401
-    ) -> None:
+    def __init__(self, *, root: str, conversations: bool = False, **options: Any) -> None:  # noqa: ANN401
         super().__init__(root=root, **options)
         self.conversations = conversations
-        self.split = split
 
     @classmethod
     def parse_name(cls, name: str) -> Clip | None:
@@ -154,9 +144,6 @@ class Beat(ParametricDataModule):
         """As in every folder of recordings, conversations aside."""
         if clip.attributes["form"] == "conversation" and not self.conversations:
             return None
-        if self.split == "official":
-            kind, first = clip.sentence.split("_")[:2]
-            return official_split(int(clip.identity.partition("_")[0]), int(kind), int(first))
         return super().split_of(clip)
 
 
@@ -180,42 +167,6 @@ def emotion_of(number: int) -> str:
         ('neutral', 'fear')
     """
     return next((emotion for last, emotion in EMOTIONS if number <= last), "neutral")
-
-
-FOUR_HOURS = frozenset((1, 2, 3, 4, 6, 7, 8, 9, 11, 21))
-"""Speakers of BEAT who recorded four hours; the others recorded one."""
-
-
-def official_split(speaker: int, kind: int, number: int) -> str | None:
-    """The split of an English recording by BEAT's own rule; None for recordings in none, and for other languages.
-
-    Of speakers who recorded one hour, BEAT cuts the first recording of each emotion, and the first conversation, into a
-    half for the test and one for validation; whole recordings are not cut here and go to the test.
-
-    Args:
-        speaker: number of the speaker.
-        kind: of the recording: 0 English speech, 1 English conversation.
-        number: first number of the text.
-
-    Example:
-        >>> official_split(2, 0, 65), official_split(2, 0, 72), official_split(2, 0, 9), official_split(5, 0, 40)
-        ('test_a', 'val', 'train', None)
-    """
-    four_hours = speaker in FOUR_HOURS
-    if kind == 1:
-        train = range(2, 12) if four_hours else (0, 2, 3, 4)
-        return {1: "test_a", **dict.fromkeys(train, "train"), **({12: "val"} if four_hours else {})}.get(number)
-    firsts = {last + 1 for last, _ in EMOTIONS[:-1]}
-    lasts = {last for last, _ in EMOTIONS[1:]}
-    if kind or not 1 <= number <= EMOTIONS[-1][0]:
-        return None
-    if number <= (8 if four_hours else 4) or number in firsts:
-        return "test_a"
-    if four_hours:
-        return "val" if 57 <= number <= 64 or number in lasts else "train"
-    if number <= 8:
-        return "val"
-    return "train" if number <= 16 or number - 1 in firsts or number == EMOTIONS[-1][0] else None
 
 
 @registry.corpus.register("LiveLink")

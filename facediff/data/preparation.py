@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from operator import methodcaller
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +27,6 @@ from facediff.utils.plain_files import parse_json, write_json
 from facediff.utils.records import read_record
 from facediff.utils.workers import processors
 
-Precision = Literal["float32", "float64"]
-"""How motion is stored; float32 takes half the disk."""
-
 STATE = "prepare.json"
 """In the output folder while preparation is running or was interrupted."""
 MANIFEST = "manifest.json"
@@ -41,18 +38,11 @@ WAV_HEADER = 44  # bytes
 
 @dataclass(frozen=True)
 class Job:
-    """One clip to write.
+    """One clip to write."""
 
-    Attributes:
-        name: the clip's name, e.g. ``F2_e01``.
-        work: gets the output folder, writes the clip with :func:`write_clip` and returns its number of frames. Must be
-            picklable: a ``functools.partial`` of a function of a module.
-        frames: number of frames if that is known cheaply, for the estimate of the disk space.
-    """
-
-    name: str
+    name: str  # of the clip, e.g. F2_e01
+    # gets the output folder, writes the clip with write_clip and returns its number of frames; it must be picklable
     work: Callable[[Path], int]
-    frames: int | None = None
 
     def __post_init__(self) -> None:
         if not CLIP_NAME.fullmatch(self.name):
@@ -72,7 +62,7 @@ class PreparationPlan:
     frame_rate: float  # motion frames a second, as written
     unit: str  # unit of the written vertices
     n_vertices: int  # vertices of every frame
-    # plain values that determine the output, dtype among them; a resumed run must have the same
+    # plain values that determine the output; a resumed run must have the same
     options: dict[str, Any]
     jobs: list[Job]  # one for each clip
     # writes what clips share (templates.pkl, mesh, regions/, clips.csv) and returns the paths of those files, relative
@@ -81,11 +71,6 @@ class PreparationPlan:
     # clips and files that the raw folder lacks, each with the expected place
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)  # other remarks for the user, one sentence each
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the motion on disk."""
-        return np.dtype(self.options.get("dtype", "float32"))
 
     @property
     def recipe(self) -> dict[str, Any]:
@@ -142,7 +127,6 @@ def prepare(
             return _report(plan, out, manifest, 0)
         _refuse_strays(plan, out)
         pending = [job for job in plan.jobs if job.name not in complete]
-        _check_space(plan, pending, out)
         # A run may be killed at any time, so the state marks the folder as unfinished before the first clip appears,
         # and is removed only once the manifest is written: readers refuse a folder with a state and without a manifest.
         begin_folder(out, STATE, plan.recipe, "facediff data prepare", None if manifest is None else settings(manifest))
@@ -239,7 +223,7 @@ def finished_frames(plan: PreparationPlan, job: Job, out: Path, recorded: Mappin
         array = open_array(motion)
     except (OSError, FaceDiffError):
         return None
-    complete = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == plan.dtype
+    complete = array.ndim == 2 and array.shape[1] == 3 * plan.n_vertices and array.dtype == np.float32
     return len(array) if complete else None
 
 
@@ -288,21 +272,6 @@ def _refuse_strays(plan: PreparationPlan, out: Path) -> None:
         raise FaceDiffError(f"{stray}: is no clip of the raw folder (any more); remove it, or choose another folder")
 
 
-def _check_space(plan: PreparationPlan, pending: list[Job], out: Path) -> None:
-    frame_counts = [job.frames for job in pending if job.frames is not None]
-    if not frame_counts:
-        return
-    # Some frame counts are known only once a clip is read; these clips are taken to be of mean length.
-    frames = sum(frame_counts) / len(frame_counts) * len(pending)
-    need = frames * (3 * plan.n_vertices * plan.dtype.itemsize + 2 * 16_000 / plan.frame_rate)
-    space = shutil.disk_usage(out).free
-    if need > space:
-        raise FaceDiffError(
-            f"{out}: about {need / 1e9:.1f} GB are needed and {space / 1e9:.1f} GB are free; make room, choose another "
-            f"disk, or prepare fewer subjects"
-        )
-
-
 # The files of a corpus folder.
 
 
@@ -316,18 +285,17 @@ def write_clip(
     clip: str,
     vertices: npt.NDArray[np.floating],
     speech: npt.NDArray[np.floating],
-    dtype: Precision = "float32",
 ) -> int:
     """Write vertices (T, V, 3) and speech (S,) of a clip, and return the number of frames."""
     motion_file, speech_file = clip_files(out, clip)
-    write_motion(motion_file, vertices, dtype)
+    write_motion(motion_file, vertices)
     write_speech(speech_file, speech)
     return len(vertices)
 
 
-def write_motion(path: Path, vertices: npt.NDArray[np.floating], dtype: Precision = "float32") -> None:
-    """Write absolute vertices (T, V, 3) as a (T, 3V) array, atomically."""
-    rows = np.ascontiguousarray(vertices.reshape(len(vertices), vertices[0].size if len(vertices) else 0), dtype=dtype)
+def write_motion(path: Path, vertices: npt.NDArray[np.floating]) -> None:
+    """Write absolute vertices (T, V, 3) as a (T, 3V) array of float32, atomically."""
+    rows = np.ascontiguousarray(vertices.reshape(len(vertices), vertices[0].size if len(vertices) else 0), np.float32)
     finite = np.isfinite(rows).all(axis=1)
     if not len(rows) or not finite.all():
         fault = f"frame {int(np.argmin(finite))} (counted from 0) holds NaN or infinity" if len(rows) else "no frame"

@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections import namedtuple
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -58,7 +57,7 @@ def toy_plan(
     works: dict[str, Callable[[Path], int]] | None = None, options: dict[str, object] | None = None, **facts: object
 ) -> PreparationPlan:
     works = works or {name: partial(write_toy, name, 3 + i) for i, name in enumerate(CLIPS)}
-    jobs = [Job(name, work, 3) for name, work in works.items()]
+    jobs = [Job(name, work) for name, work in works.items()]
     return PreparationPlan("toy", 25.0, "m", 2, options or {"dtype": "float32"}, jobs, write_toy_templates, **facts)  # type: ignore[arg-type]
 
 
@@ -182,21 +181,6 @@ def test_foreign_folders_and_strays_are_refused(tmp_path: Path) -> None:
     prepare(toy_plan(), out, workers=1)
     with pytest.raises(FaceDiffError, match=r"A_e02\.npy: is no clip of the raw folder"):
         prepare(toy_plan({"A_e01": partial(write_toy, "A_e01", 3)}), out, workers=1)
-
-
-def test_too_little_disk_space_is_reported_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    # 9 frames of 2 vertices in float32, and 640 samples of 16 bit for each.
-    needed = 9 * (2 * 3 * 4 + 640 * 2)
-    usage = namedtuple("usage", "free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(needed - 1))
-    with pytest.raises(FaceDiffError, match="GB are needed"):
-        prepare(toy_plan(), out, workers=1)
-    assert not out.exists()
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(needed))
-    assert prepare(toy_plan(), out, workers=1).sound
 
 
 def test_speech_of_16_bit_goes_through_unchanged_and_loud_speech_is_clipped(tmp_path: Path) -> None:

@@ -12,14 +12,12 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.data.preparation import (
     Job,
-    Precision,
     PreparationPlan,
     bases,
     choose_subjects,
@@ -44,11 +42,7 @@ FRAME_RATE = 25.0
 MESH_FILE = "BIWI.ply"
 REGION_FILES = ("lve.txt", "fdd.txt")
 
-Normalisation = Literal["codetalker", "none"]
-UNITS: dict[Normalisation, str] = {
-    "codetalker": "normalised (the square root of a face's surface area is 1, about 185 mm)",
-    "none": "mm",
-}
+UNIT = "normalised (the square root of a face's surface area is 1, about 185 mm)"
 
 SOUND_NAME = re.compile(r"([FM]\d)_(e\d\d)(_cut)?")
 SOUND_SUFFIXES = (".wav", ".flac", ".flv", ".mp4", ".avi", ".mov", ".mkv", ".webm")  # the first that is there is used
@@ -64,18 +58,13 @@ Array = npt.NDArray[np.float64]
 def plan(
     raw: Path,
     *,
-    normalise: Normalisation = "codetalker",
-    dtype: Precision = "float32",
     subjects: Sequence[str] | None = None,
     regions: Path | None = None,
 ) -> PreparationPlan:
-    """Scan a raw folder of BIWI.
+    """Scan a raw folder of BIWI; its frames are turned, centred and scaled one by one, as in published work.
 
     Args:
         raw: the folder, or the folder above the one that the archives unpacked to.
-        normalise: ``codetalker``: turned, centred and scaled frame by frame, as in published work; ``none``: as in the
-            raw files, in mm
-        dtype: of the motion on disk; ``float64`` is what CodeTalker writes and takes twice the space
         subjects: only these, e.g. F2,F3,M5; all that are there if not given
         regions: folder with lve.txt and fdd.txt; regions/ of the raw folder if not given
     """
@@ -108,32 +97,34 @@ def plan(
             elif name not in sounds:
                 gaps[name] = f"expected its sound, {raw / 'audio' / name}.wav or {raw / 'videos' / name}.flv"
             elif template is not None:
-                work = partial(prepare_clip, name, folder, sounds[name], template, normalise, dtype)
-                jobs.append(Job(name, work, _count_frames(name, folder, notes)))
+                jobs.append(Job(name, partial(prepare_clip, name, folder, sounds[name], template)))
+                if frames := gaps_in(list(frame_files(folder))):
+                    notes.append(
+                        f"{name}: frames {', '.join(frames)} are not in {folder}; it is written without them, so that "
+                        f"speech and motion are no longer synchronous from there on"
+                    )
     refuse_empty(raw, "BIWI", jobs, gaps)
     return PreparationPlan(
         corpus="biwi",
         frame_rate=FRAME_RATE,
-        unit=UNITS[normalise],
+        unit=UNIT,
         n_vertices=len(read_template(next(iter(templates.values())))[0]),
-        options={"normalise": normalise, "dtype": dtype, "subjects": "all" if subjects is None else selected},
+        options={"normalise": "codetalker", "dtype": "float32", "subjects": "all" if subjects is None else selected},
         jobs=jobs,
-        shared=partial(_write_shared, templates, normalise, region_files),
+        shared=partial(_write_shared, templates, region_files),
         missing=gaps,
         notes=notes,
     )
 
 
-def prepare_clip(
-    name: str, folder: Path, sound: Path, template_file: Path, normalise: Normalisation, dtype: Precision, out: Path
-) -> int:
+def prepare_clip(name: str, folder: Path, sound: Path, template_file: Path, out: Path) -> int:
     """Write one sequence and return its number of frames."""
     from facediff.speech.audio import read_speech
 
     template, faces = read_template(template_file)
     files = list(frame_files(folder).values())
     check_sizes(files)
-    vertices = np.empty((len(files), *template.shape), dtype)
+    vertices = np.empty((len(files), *template.shape), np.float32)
     for target, file in zip(vertices, files, strict=True):
         frame = read_vl(file)
         if frame.shape != template.shape or not np.isfinite(frame).all():
@@ -141,8 +132,9 @@ def prepare_clip(
                 f"{file}: has {len(frame)} vertices, or NaN among them; expected {len(template)} finite ones as in "
                 f"{template_file}; copy it again, or remove the sequence from {folder.parent}"
             )
-        target[:] = _normalised(frame, faces, normalise)
-    return write_clip(out, name, vertices, read_speech(sound), dtype)
+        with np.errstate(all="ignore"):  # NaN is refused when the clip is written
+            target[:] = codetalker(frame, faces)
+    return write_clip(out, name, vertices, read_speech(sound))
 
 
 def codetalker(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> Array:
@@ -159,20 +151,8 @@ def codetalker(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer
     return centred / np.sqrt(surface_area(centred, faces))
 
 
-def _normalised(
-    vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.int32], method: Normalisation
-) -> npt.NDArray[np.floating]:
-    with np.errstate(all="ignore"):  # NaN is refused when the clip is written
-        return vertices if method == "none" else codetalker(vertices, faces)
-
-
-def _write_shared(
-    templates: dict[str, Path], normalise: Normalisation, region_files: Sequence[Path], out: Path
-) -> list[str]:
-    neutral = {
-        subject: np.asarray(_normalised(*read_template(path), normalise), np.float64)
-        for subject, path in templates.items()
-    }
+def _write_shared(templates: dict[str, Path], region_files: Sequence[Path], out: Path) -> list[str]:
+    neutral = {subject: codetalker(*read_template(path)) for subject, path in templates.items()}
     write_templates(out / "templates.pkl", neutral)
     speaker = next((subject for subject in SEEN if subject in neutral), next(iter(neutral)))
     write_mesh(out / MESH_FILE, neutral[speaker], read_template(templates[speaker])[1])
@@ -212,17 +192,6 @@ def _find_sounds(raw: Path) -> dict[str, Path]:
                 name = f"{match[1]}_{match[2]}"
                 ranked[name] = min(ranked.get(name, (rank, path)), (rank, path))
     return {name: path for name, (_, path) in ranked.items()}
-
-
-def _count_frames(name: str, folder: Path, notes: list[str]) -> int:
-    """Frames of a sequence; gaps in their numbers are noted."""
-    numbers = list(frame_files(folder))
-    if frames := gaps_in(numbers):
-        notes.append(
-            f"{name}: frames {', '.join(frames)} are not in {folder}; it is written without them, so that speech and "
-            f"motion are no longer synchronous from there on"
-        )
-    return len(numbers)
 
 
 # Reading frames (one ``.vl`` file each: a count of vertices, then float32 x, y, z for each) and templates.

@@ -13,14 +13,13 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from facediff.data.preparation import (
     Job,
-    Precision,
     PreparationPlan,
     choose_subjects,
     copy_files,
@@ -60,7 +59,6 @@ MISSING_REGION = (
 )
 MISSING_MASKS = "expected in the raw folder or next to the FLAME model; from flame.is.tue.mpg.de (FLAME vertex masks)"
 
-Shape = Literal["subject", "clip"]
 Array = npt.NDArray[np.float64]
 
 
@@ -69,22 +67,18 @@ def plan(
     *,
     flame: Path,
     audio: Path | None = None,
-    shape: Shape = "subject",
-    dtype: Precision = "float32",
     subjects: Sequence[str] | None = None,
     regions: Path | None = None,
     quiet: bool = True,
 ) -> PreparationPlan:
     """Scan a raw folder of 3DMEAD. Every clip's parameters are read once, for the speakers' mean shapes.
 
+    Vertices have the mean shape of their speaker, as the template, so that offsets from it are motion alone.
+
     Args:
         raw: EMOTE's or ProbTalk3D's folder, or a folder above it.
         flame: the user's own FLAME model file; FLAME 2020's, as the parameters are for that model.
         audio: folder with MEAD's sound; the raw folder if None.
-        shape: shape parameters of a clip's vertices: the speaker's mean (``subject``), as in the template, so that
-            offsets from the template are motion alone; or the clip's own (``clip``), as in EMOTE, so that offsets
-            contain differences of shape.
-        dtype: of the motion on disk.
         subjects: only these speakers; all that are there if None.
         regions: folder with ``lve.txt`` and ``fdd.txt``; ``regions/`` of the raw folder if None.
         quiet: no progress bar.
@@ -97,7 +91,7 @@ def plan(
     recordings = {name: file for name, file in distribution.recordings.items() if name[:4] in selected}
     gaps = {name: text for name, text in distribution.without_parameters.items() if name[:4] in selected}
     sounds = find_sounds(raw if audio is None else audio)
-    frames, shapes, problems = _survey(recordings, quiet)
+    shapes, problems = _survey(recordings, quiet)
     jobs = []
     for name, file in recordings.items():
         if name not in sounds:
@@ -108,9 +102,7 @@ def plan(
         elif name in problems:
             jobs.append(Job(name, partial(refuse, problems[name])))
         else:
-            mean = shapes[name[:4]] if shape == "subject" else None
-            work = partial(prepare_clip, name, file, sounds[name], flame, mean, dtype)
-            jobs.append(Job(name, work, frames[name]))
+            jobs.append(Job(name, partial(prepare_clip, name, file, sounds[name], flame, shapes[name[:4]])))
     refuse_empty(raw, "3DMEAD", jobs, gaps)
     masks = [path for path in (find_file(raw, MASKS_FILE), flame.parent / MASKS_FILE) if path and path.is_file()][:1]
     if not masks:
@@ -123,7 +115,7 @@ def plan(
         frame_rate=FRAME_RATE,
         unit="m",
         n_vertices=model.n_vertices,
-        options={"shape": shape, "dtype": dtype, "subjects": selected if subjects else "all", "flame": digest},
+        options={"shape": "subject", "dtype": "float32", "subjects": selected if subjects else "all", "flame": digest},
         jobs=jobs,
         shared=partial(_write_shared, flame, list(recordings), shapes, masks, region_files),
         missing=gaps,
@@ -131,16 +123,13 @@ def plan(
     )
 
 
-def prepare_clip(
-    name: str, file: Path, sound: Path, model: Path, shape: Array | None, dtype: Precision, out: Path
-) -> int:
-    """Write one clip, with its own shape if ``shape`` is None, and return its number of frames."""
+def prepare_clip(name: str, file: Path, sound: Path, model: Path, shape: Array, out: Path) -> int:
+    """Write one clip with its speaker's shape, and return its number of frames."""
     from facediff.speech.audio import read_speech
 
     parameters = read_parameters(file)
-    shape = parameters.shape if shape is None else shape
     vertices = load_flame(model).vertices(shape, parameters.expression, parameters.jaw)
-    return write_clip(out, name, vertices, read_speech(sound), dtype)
+    return write_clip(out, name, vertices, read_speech(sound))
 
 
 def refuse(problem: str, out: Path) -> NoReturn:
@@ -154,9 +143,8 @@ def load_flame(path: Path) -> Flame:
     return Flame.read(path)
 
 
-def _survey(recordings: Mapping[str, Path], quiet: bool) -> tuple[dict[str, int], dict[str, Array], dict[str, str]]:
-    """Frames of every clip, every speaker's mean shape over all frames, and why clips cannot be read."""
-    lengths: dict[str, int] = {}
+def _survey(recordings: Mapping[str, Path], quiet: bool) -> tuple[dict[str, Array], dict[str, str]]:
+    """Every speaker's mean shape over all frames, and why clips cannot be read."""
     problems: dict[str, str] = {}
     sums: dict[str, Array] = {}
     counts: Counter[str] = Counter()
@@ -168,11 +156,11 @@ def _survey(recordings: Mapping[str, Path], quiet: bool) -> tuple[dict[str, int]
         except FaceDiffError as error:
             problems[name] = str(error)
             continue
-        frames = lengths[name] = len(parameters.jaw)
+        frames = len(parameters.jaw)
         total = sums.setdefault(name[:4], np.zeros(SHAPES))
         total[: len(parameters.shape)] += frames * parameters.shape
         counts[name[:4]] += frames
-    return lengths, {subject: total / counts[subject] for subject, total in sums.items()}, problems
+    return {subject: total / counts[subject] for subject, total in sums.items()}, problems
 
 
 def _compare_speakers(speakers: list[str], base: Path, gaps: dict[str, str]) -> list[str]:

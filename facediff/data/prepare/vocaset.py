@@ -19,7 +19,6 @@ import numpy.typing as npt
 from facediff.data.corpus import as_template, load_template_dict
 from facediff.data.preparation import (
     Job,
-    Precision,
     PreparationPlan,
     copy_files,
     find_file,
@@ -28,8 +27,7 @@ from facediff.data.preparation import (
     write_clip,
     write_templates,
 )
-from facediff.data.reconstructions import resample_frames
-from facediff.errors import FaceDiffError, damaged, refuse_idle
+from facediff.errors import FaceDiffError, damaged
 from facediff.utils.arrays import open_vertices
 from facediff.utils.pickles import load_pickle
 
@@ -46,7 +44,6 @@ REGION_FILES = ("lve.txt", "fdd.txt")
 FULL_SCALE = 32768.0  # of 16-bit samples
 SAMPLE_RATES = (8_000, 192_000)
 
-Decimation = Literal["every_second", "filtered"]
 Array = npt.NDArray[np.float64]
 
 
@@ -62,21 +59,15 @@ def plan(
     raw: Path,
     *,
     frame_rate: Literal[30, 60] = 30,
-    decimate: Decimation = "every_second",
-    dtype: Precision = "float32",
     regions: Path | None = None,
 ) -> PreparationPlan:
     """Scan a raw folder of VOCASET. The sound of all clips is read into memory, once.
 
     Args:
         raw: the folder, or the folder above it.
-        frame_rate: 30, which every published model uses; or 60, as in the raw files, for other projects' loaders
-        decimate: how 60 becomes 30: ``every_second`` frame, beginning with the first, as in published work; or
-            ``filtered``, which first removes the frequencies that would alias
-        dtype: of the motion on disk
+        frame_rate: 30, every second frame, which every published model uses; or 60, for other projects' loaders
         regions: folder with lists of vertices; regions/ of the raw folder if not given
     """
-    refuse_idle("nothing is decimated at 60 frames a second", decimate=frame_rate == 60 and decimate != "every_second")
     vertices, templates_file = _need(raw, VERTICES), _need(raw, TEMPLATES)
     row_map, sounds = _nested(_need(raw, ROWS)), _nested(_need(raw, AUDIO))
     n_vertices = open_vertices(vertices).shape[1]
@@ -103,9 +94,7 @@ def plan(
             recording = VocasetRecording(
                 _rows(rows_of[sentence], name, notes), sound_of[sentence], f"{subject} {sentence}"
             )
-            frames = len(recording.rows) if frame_rate == RAW_RATE else -(-len(recording.rows) // 2)
-            work = partial(prepare_clip, name, recording, vertices, frame_rate, decimate, dtype)
-            jobs.append(Job(name, work, frames))
+            jobs.append(Job(name, partial(prepare_clip, name, recording, vertices, RAW_RATE // frame_rate)))
     if len(row_map) < SUBJECTS:
         notes.append(f"{ROWS} has {len(row_map)} of the {SUBJECTS} subjects")
     refuse_empty(raw, "VOCASET", jobs, gaps)
@@ -114,7 +103,7 @@ def plan(
         frame_rate=float(frame_rate),
         unit="m",
         n_vertices=n_vertices,
-        options={"frame_rate": frame_rate, "decimate": decimate, "dtype": dtype},
+        options={"frame_rate": frame_rate, "decimate": "every_second", "dtype": "float32"},
         jobs=jobs,
         shared=partial(_write_shared, templates, extras, region_files),
         missing=gaps,
@@ -122,16 +111,8 @@ def plan(
     )
 
 
-def prepare_clip(
-    name: str,
-    recording: VocasetRecording,
-    vertices: Path,
-    frame_rate: int,
-    decimate: Decimation,
-    dtype: Precision,
-    out: Path,
-) -> int:
-    """Write one clip and return its number of frames.
+def prepare_clip(name: str, recording: VocasetRecording, vertices: Path, stride: int, out: Path) -> int:
+    """Write every ``stride``-th frame of a clip, beginning with the first, and return their number.
 
     As many frames are used as both the map and the sound have, as in VOCA.
     """
@@ -148,17 +129,7 @@ def prepare_clip(
             f"{recording.where}: frame {frame} is row {rows[frame]} in {ROWS}, but {vertices} has {len(store)} rows; "
             f"the files belong to different releases or one is truncated"
         )
-    motion = np.asarray(store[rows])
-    motion = halved(motion, decimate) if frame_rate != RAW_RATE else motion
-    speech = to_speech(samples, rate, recording.where)
-    return write_clip(out, name, motion, speech, dtype)
-
-
-def halved(motion: npt.NDArray[np.floating], decimate: Decimation) -> npt.NDArray[np.floating]:
-    """Motion (T, V, 3) at half its frame rate; frame k of the result is frame 2 k."""
-    if decimate == "every_second":
-        return motion[::2]
-    return resample_frames(motion.reshape(len(motion), -1), RAW_RATE, RAW_RATE // 2).reshape(-1, *motion.shape[1:])
+    return write_clip(out, name, np.asarray(store[rows[::stride]]), to_speech(samples, rate, recording.where))
 
 
 def read_samples(entry: object, where: str) -> tuple[npt.NDArray[np.float32], float]:

@@ -11,7 +11,7 @@ import soundfile
 
 from facediff.data.preparation import PreparationReport, prepare
 from facediff.data.prepare import vocaset
-from facediff.data.prepare.vocaset import halved, read_samples
+from facediff.data.prepare.vocaset import read_samples
 from facediff.errors import FaceDiffError
 from facediff.utils.pickles import load_pickle
 from tests.fakes.vocaset import (
@@ -71,25 +71,11 @@ def test_every_second_frame_is_used_unchanged(tmp_path: Path) -> None:
 
 
 def test_all_60_frames_a_second_can_be_kept(raw: Path) -> None:
-    out, report = prepared(raw, frame_rate=60, dtype="float64")
+    out, report = prepared(raw, frame_rate=60)
     motion = np.load(out / "vertices_npy" / f"{CLIP}.npy")
-    assert motion.dtype == np.float64
     assert np.array_equal(motion, motion_of(TRAIN, "sentence01", 25).reshape(25, -1))
     assert report.totals["seconds"] == pytest.approx(25 / 60, abs=1e-3)
     assert '"frame_rate": 60.0' in (out / "manifest.json").read_text()
-
-
-def test_filtering_removes_aliasing_frequencies_and_keeps_the_others() -> None:
-    time = np.arange(241) / 60
-    slow, fast = np.sin(2 * np.pi * 4 * time), np.sin(2 * np.pi * 23 * time)
-    motion = np.zeros((241, 2, 3))
-    motion[:, 0, 0], motion[:, 1, 1] = slow, fast
-    plain, filtered = halved(motion, "every_second"), halved(motion, "filtered")
-    inner = slice(20, 100)
-    np.testing.assert_allclose(filtered[inner, 0, 0], slow[::2][inner], atol=2e-3)
-    assert np.abs(filtered[inner, 1, 1]).max() < 2e-3
-    assert np.abs(plain[inner, 1, 1]).max() > 0.9
-    assert filtered.shape == (120, 2, 3)
 
 
 def test_speech_is_resampled_to_16_khz(raw: Path) -> None:
