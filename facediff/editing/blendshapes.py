@@ -229,15 +229,14 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         )
     animation.refuse_not_finite()
     head, animation = animation.head, animation.still()
-    moving = moving_shapes(animation, shapes, options)
-    terms = objective(moving, shapes, options, animation.frame_rate)
+    terms = objective(animation, shapes, options)
     products, square = [], 0.0
-    for _, moved in _displacements(animation, moving):
+    for _, moved in _displacements(animation, terms):
         # Frame by frame only the products with the shapes are kept: (T, K) numbers instead of (T, 3N).
         products.append(moved.reshape(len(moved), -1) @ terms.projection.T)
         square += float(np.square(moved).sum())
     right = np.concatenate(products)
-    amplitude = float(np.sqrt(square / (len(animation.vertices) * len(moving.vertices))))
+    amplitude = float(np.sqrt(square / (len(animation.vertices) * len(terms.vertices))))
     scale = terms.scale
     problem = Problem(terms.matrix, right, terms.coupling, options.lower * scale, options.upper * scale)
     tolerance = TOLERANCE * scale
@@ -248,8 +247,8 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         scaled_weights, converged = minimise(problem, tolerance)
     values = np.full((len(right), len(shapes.names)), np.clip(0.0, options.lower, options.upper))
     # Division may lead past a bound by a rounding error.
-    values[:, moving.indices] = np.clip(scaled_weights / scale, options.lower, options.upper)
-    rms, largest = _residuals(animation, moving, values[:, moving.indices])
+    values[:, terms.indices] = np.clip(scaled_weights / scale, options.lower, options.upper)
+    rms, largest = _residuals(animation, terms, values[:, terms.indices])
     millimetres = 1000.0 * metres_per_unit(animation.unit)
     # Over all frames together: a frame in which the face hardly moves has a large share of nothing left.
     remaining = float(np.sqrt(np.square(rms).mean()))
@@ -272,7 +271,7 @@ def solve(animation: Animation, shapes: ShapeSet, options: SolveOptions | None =
         residual_max_mm=millimetres * largest,
         amplitude_mm=millimetres * amplitude,
         frame_rate=animation.frame_rate,
-        still=tuple(name for k, name in enumerate(shapes.names) if k not in moving.indices),
+        still=tuple(name for k, name in enumerate(shapes.names) if k not in terms.indices),
         metadata={**animation.metadata, **{f"solve {key}": value for key, value in about.items()}},
         head=None if head is None else head[:, :3],
     )
@@ -327,43 +326,20 @@ def key_frames(values: Array, tolerance: float) -> Indices:
 
 
 @dataclass(frozen=True)
-class Moving:
-    """The shapes that move something, on the vertices that count."""
-
-    indices: Indices  # (K,) numbers of the shapes in the set
-    vertices: Indices  # (N,) vertices that count
-    area: Array  # (N,) their shares of the area, which sum to one
-    deltas: Array  # (K, 3N) displacements
-    energy: Array  # (K,) weighted mean square of each
-
-
-@dataclass(frozen=True)
 class Objective:
-    """The objective ½ Σ xᵀ M x − Σ (P v)ᵀ x + ½ c Σ ‖x_t − x_{t−1}‖² in x, weights times `scale`."""
+    """½ Σ xᵀ M x − Σ (P v)ᵀ x + ½ c Σ ‖x_t − x_{t−1}‖² in x, weights times `scale`, of shapes that move something."""
 
+    indices: Indices  # (K,) numbers of these shapes in the set
+    vertices: Indices  # (N,) vertices that count
+    deltas: Array  # (K, 3N) their displacements
     scale: Array  # (K,) root of each shape's energy: with it, M has ones on its diagonal
     projection: Array  # P (K, 3N), of the displacements v of the vertices that count
     matrix: Array  # M (K, K)
     coupling: float  # c
 
 
-def objective(moving: Moving, shapes: ShapeSet, options: SolveOptions, frame_rate: float) -> Objective:
+def objective(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> Objective:
     """The terms that do not depend on the motion."""
-    scale = np.sqrt(moving.energy)
-    projection = moving.deltas * np.repeat(moving.area, 3) / scale[:, None]
-    matrix = projection @ (moving.deltas / scale[:, None]).T + options.ridge * np.eye(len(scale))
-    for left, right in mirror_pairs(tuple(shapes.names[k] for k in moving.indices)):
-        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[right] ** 2)
-        row = np.zeros(len(scale))
-        row[left], row[right] = 1.0 / scale[left], -1.0 / scale[right]
-        matrix += cost * np.outer(row, row)
-    # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
-    coupling = options.smoothness * (frame_rate / STATED_RATE) ** 2
-    return Objective(scale, projection, 0.5 * (matrix + matrix.T), coupling)
-
-
-def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions) -> Moving:
-    """The shapes of a set that move vertices which count."""
     vertices = np.arange(len(animation.template))
     if options.region is not None:
         check_factors([options.region], animation.regions, animation.name)
@@ -373,9 +349,9 @@ def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions)
     if options.area_weighted and animation.faces is not None and len(animation.faces):
         areas = vertex_areas(animation.template, animation.faces)[vertices]
         area = areas if areas.sum() > 0 else area
-    area = area / max(float(area.sum()), np.finfo(float).tiny)
+    area = np.repeat(area / max(float(area.sum()), np.finfo(float).tiny), 3)
     deltas = shapes.deltas[:, vertices].reshape(len(shapes.names), -1).astype(np.float64)
-    energy = np.square(deltas) @ np.repeat(area, 3)
+    energy = np.square(deltas) @ area
     # A shape that moves nothing among the vertices that count has no energy to be scaled by.
     still = np.array([name in shapes.still for name in shapes.names])
     indices = np.flatnonzero(~still & (energy > 1e-12 * energy.max(initial=0.0)))
@@ -383,7 +359,17 @@ def moving_shapes(animation: Animation, shapes: ShapeSet, options: SolveOptions)
         raise FaceDiffError(
             f"{animation.name}: no shape moves any vertex that counts; give other shapes or another region"
         )
-    return Moving(indices, vertices, area, deltas[indices], energy[indices])
+    deltas, scale = deltas[indices], np.sqrt(energy[indices])
+    projection = deltas * area / scale[:, None]
+    matrix = projection @ (deltas / scale[:, None]).T + options.ridge * np.eye(len(scale))
+    for left, right in mirror_pairs(tuple(shapes.names[k] for k in indices)):
+        cost = 0.5 * options.symmetry * (scale[left] ** 2 + scale[right] ** 2)
+        row = np.zeros(len(scale))
+        row[left], row[right] = 1.0 / scale[left], -1.0 / scale[right]
+        matrix += cost * np.outer(row, row)
+    # A movement that takes as many seconds takes more steps at a higher frame rate, each the smaller.
+    coupling = options.smoothness * (animation.frame_rate / STATED_RATE) ** 2
+    return Objective(indices, vertices, deltas, scale, projection, 0.5 * (matrix + matrix.T), coupling)
 
 
 def vertex_areas(vertices: Floats, faces: Integers) -> Array:
@@ -392,20 +378,20 @@ def vertex_areas(vertices: Floats, faces: Integers) -> Array:
     return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)
 
 
-def _displacements(animation: Animation, moving: Moving) -> Iterator[tuple[slice, Array]]:
+def _displacements(animation: Animation, terms: Objective) -> Iterator[tuple[slice, Array]]:
     """Displacements (frames, N, 3) from the template, some frames at a time."""
     template = np.asarray(animation.template, np.float64)
     step = max(1, CHUNK_BYTES // (24 * len(template)))
     for first in range(0, len(animation.vertices), step):
         frames = slice(first, first + step)
-        yield frames, (np.asarray(animation.vertices[frames], np.float64) - template)[:, moving.vertices]
+        yield frames, (np.asarray(animation.vertices[frames], np.float64) - template)[:, terms.vertices]
 
 
-def _residuals(animation: Animation, moving: Moving, values: Array) -> tuple[Array, Array]:
+def _residuals(animation: Animation, terms: Objective, values: Array) -> tuple[Array, Array]:
     """Root mean square and maximum (T,) over the vertices of the residuals."""
     rms, largest = [], []
-    for frames, moved in _displacements(animation, moving):
-        square = np.square(moved - (values[frames] @ moving.deltas).reshape(moved.shape)).sum(axis=-1)
+    for frames, moved in _displacements(animation, terms):
+        square = np.square(moved - (values[frames] @ terms.deltas).reshape(moved.shape)).sum(axis=-1)
         rms.append(np.sqrt(square.mean(axis=-1)))
         largest.append(np.sqrt(square.max(axis=-1)))
     return np.concatenate(rms), np.concatenate(largest)

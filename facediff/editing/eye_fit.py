@@ -59,7 +59,7 @@ def check_eyes(
     source_edges = [edges for eye in (0, 1) if (edges := lid_edges(face.vertices, source, eye)) is not None]
     if len(source_edges) < 2:
         return None, [], []
-    faults, remarks, figures = [], [], dict[str, float]()
+    faults, remarks, figures = list[str](), list[str](), dict[str, float]()
     blink, left = fullest_blink(animation, source_edges)
     target_edges = [lid_edges(correspondence.laid.vertices, target, eye) for eye in (0, 1)]
     unfound = [side for side, edges in zip(("right", "left"), target_edges, strict=True) if edges is None]
@@ -88,7 +88,7 @@ def _check_lids(
     """Figures and faults of the lids in the frame of the fullest blink."""
     source, target = correspondence.features
     assert source is not None and target is not None  # noqa: S101, PT018 - for type checkers
-    rest, faults = Surface(correspondence.laid.vertices, correspondence.target_faces), []
+    rest, faults = Surface(correspondence.laid.vertices, correspondence.target_faces), list[str]()
     posed, original = _laid(correspondence, carried.vertices[blink]), np.asarray(animation.vertices[blink], np.float64)
     seen = [_still_seen(rest, posed, target, eye) for eye in (0, 1)]
     gaps, holes = ([pair[k] for pair in seen] for k in (0, 1))

@@ -527,7 +527,10 @@ def find_features(vertices: Array, faces: Indices, expected: Features | Opening 
         elif (known := expected.eyes[side]) is not None:
             # A longer or shorter face has its eyes elsewhere: the larger window comes second, as for the mouth.
             middle, wide = known.centre[:2], known.width
-            windows = [SearchWindow(*middle, 0.85 * grown * wide, 0.75 * grown * wide, wide) for grown in (1.0, 1.6)]
+            windows = [
+                SearchWindow(middle[0], middle[1], 0.85 * grown * wide, 0.75 * grown * wide, wide)
+                for grown in (1.0, 1.6)
+            ]
         eye = next((eye for window in windows if (eye := view.opening(window, skin, *OPEN_EYE)) is not None), None)
         eyes.append(None if eye is None else view.completed(eye, windows[0].expected))
     codes = view.codes([mouth, *eyes], (MOUTH_REACH, EYE_REACH, EYE_REACH))

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.animation import Animation
-from facediff.editing.blendshapes import AROUND, SolveOptions, moving_shapes, objective
+from facediff.editing.blendshapes import AROUND, SolveOptions, objective
 from facediff.editing.bounded import ACTIVE, Pivoting
 from facediff.editing.shapes import ShapeSet
 from facediff.errors import FaceDiffError
@@ -53,8 +53,7 @@ class FrameSolver:
         self.options = options = options or SolveOptions()
         rest = shapes.neutral.astype(np.float32)
         face = Animation("shapes", rest[None], rest, frame_rate, faces=faces, regions=dict(regions or {}))
-        self._moving = moving = moving_shapes(face, shapes, options)
-        terms = objective(moving, shapes, options, frame_rate)
+        terms = objective(face, shapes, options)
         self._scale, self._coupling = terms.scale, terms.coupling
         matrix = terms.matrix + terms.coupling * np.eye(len(terms.scale))
         self._lower, self._upper = options.lower * terms.scale, options.upper * terms.scale
@@ -64,7 +63,7 @@ class FrameSolver:
         self._fading = max(1, round(AROUND * frame_rate))
         # Vertices that no shape moves add nothing to a product.
         moved = (terms.projection.reshape(len(matrix), -1, 3) != 0).any(axis=(0, 2))
-        self._used = moving.vertices[moved]
+        self._indices, self._used = terms.indices, terms.vertices[moved]
         self._projection = np.ascontiguousarray(
             terms.projection.reshape(len(matrix), -1, 3)[:, moved].reshape(len(matrix), -1)
         )
@@ -92,5 +91,5 @@ class FrameSolver:
         self._last = self._final.solve(right, lower, upper)
         weights = np.full(len(self.shapes.names), np.clip(0.0, self.options.lower, self.options.upper))
         # Division may lead past a bound by a rounding error.
-        weights[self._moving.indices] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
+        weights[self._indices] = np.clip(self._last / self._scale, self.options.lower, self.options.upper)
         return weights

@@ -28,10 +28,8 @@ def read_weights(path: Path) -> Animation:
     rig = built_in_rig()
     # By ARKit's own spelling.
     space = replace(clip.space, channels=tuple(arkit_name(name) or name for name in clip.space.channels))
-    column = {name: row for row, name in enumerate(rig.names)}
-    nothing = np.zeros(rig.neutral.shape)
-    names = [space.channels[channel] for channel in space.face]
-    deltas = np.stack([rig.deltas[column[name]] if name in column else nothing for name in names])
+    moves = dict(zip(rig.names, rig.deltas, strict=True))
+    deltas = np.stack([moves.get(space.channels[channel], np.zeros(rig.neutral.shape)) for channel in space.face])
     decoder = ChannelDecoder(space, np.zeros(len(space.channels)), rig.neutral, deltas)
     points = np.asarray(clip.values, np.float32)[..., None]
     animation = Animation(

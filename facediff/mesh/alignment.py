@@ -62,8 +62,9 @@ def align(source: Floats, target: Floats, *, weights: Floats | None = None, scal
         >>> round(found.scale, 6), found.translation.round(6)
         (3.0, array([1., 1., 1.]))
     """
-    source, target, weights = _checked(source, target, weights)
-    rotation, translation, factor = fit_similarities(source[None], target, weights[None], scale)
+    points: Array = np.asarray(source, np.float64)
+    base: Array = np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
+    rotation, translation, factor = fit_similarities(points[None], np.asarray(target, np.float64), base[None], scale)
     return Similarity(rotation[0], translation[0], float(factor[0]))
 
 
@@ -77,8 +78,9 @@ def robust_align(source: Floats, target: Floats, *, weights: Floats | None = Non
 
     Arguments as in :func:`align`; weights multiply the robust ones, and points of weight 0 are ignored.
     """
-    source, target, weights = _checked(source, target, weights)
-    rotation, translation, factor = robust_fit(source[None], target, weights, scale=scale)
+    points, goal = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    base = None if weights is None else np.asarray(weights, np.float64)
+    rotation, translation, factor = robust_fit(points[None], goal, base, scale=scale)
     return Similarity(rotation[0], translation[0], float(factor[0]))
 
 
@@ -175,12 +177,6 @@ def _residuals(source: Array, target: Array, rotation: Array, translation: Array
     left += translation[:, None]
     left -= target
     return np.sqrt(np.einsum("bni,bni->bn", left, left))
-
-
-def _checked(source: Floats, target: Floats, weights: Floats | None) -> tuple[Array, Array, Array]:
-    points: Array = np.asarray(source, np.float64)
-    goal: Array = np.asarray(target, np.float64)
-    return points, goal, np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
 
 
 # Removing the head's rigid motion from a sequence of faces that may be too large to be held in memory twice.

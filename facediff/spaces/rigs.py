@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -59,16 +59,10 @@ class LinearRig:
     @property
     def space(self) -> Space:
         """The space of the rig's weights."""
-        arkit = set(self.names) <= set(ARKIT)
-        return Space(
-            "arkit" if arkit else "linear",
-            self.names,
-            "arkit" if arkit else "",
-            rig=self.title,
-            rig_hash=self.hash,
-            valid_range=(0.0, 1.0) if arkit else None,
-            absent=absent_from(self.names) if arkit else (),
-        )
+        space = Space("linear", self.names, rig=self.title, rig_hash=self.hash)
+        if not set(self.names) <= set(ARKIT):
+            return space
+        return replace(space, kind="arkit", version="arkit", valid_range=(0.0, 1.0), absent=absent_from(self.names))
 
     def only(self, names: Sequence[str]) -> LinearRig:
         """The rig's channels of these names, in their order."""

@@ -83,22 +83,22 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
                 f"{file}: has {len(mesh.vertices)} vertices, or other triangles, and {files[0].name} "
                 f"{len(first.vertices)}; expected shapes of one mesh with the order of its vertices kept"
             )
-    names, points, notes = [file.stem for file in shapes], [mesh.vertices for mesh in meshes[len(rest) :]], []
+    names, moves, notes = [file.stem for file in shapes], [mesh.vertices for mesh in meshes[len(rest) :]], []
     for name in HALVED if rest and plain(rest[0].stem) == ICT_NEUTRAL else ():
         halves = [f"{name}_L", f"{name}_R"]
         if all(half in names for half in halves):
-            left, right = (points[names.index(half)] for half in halves)
+            left, right = (moves[names.index(half)] for half in halves)
             rows = [row for row, other in enumerate(names) if other not in halves]
-            names, points = (
+            names, moves = (
                 [*(names[k] for k in rows), name],
-                [*(points[k] for k in rows), left + right - first.vertices],
+                [*(moves[k] for k in rows), left + right - first.vertices],
             )
             notes.append(f"{name} is the sum of its halves {' and '.join(halves)}")
     return ShapeFiles(
         path,
         files[0],
         tuple(names),
-        np.stack(points),
+        np.stack(moves),
         first.vertices if rest else None,
         first.faces if len(first.faces) else None,
         rest=rest[0].name if rest else "",

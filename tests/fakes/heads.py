@@ -39,7 +39,7 @@ def nearest_vertices(landmarks: Landmarks) -> list[list[int]]:
     """The vertices of both meshes that weigh most in each place."""
     every = np.arange(len(landmarks))
     sides = [side.corners[every, side.weights.argmax(axis=1)] for side in (landmarks.source, landmarks.target)]
-    return np.stack(sides, axis=1).tolist()  # type: ignore[no-any-return]
+    return np.stack(sides, axis=1).tolist()
 
 
 def talking(shape: Shape | None = None) -> Animation:

@@ -13,14 +13,9 @@ from facediff.editing.controls.procedural import EDITED, copied, with_metadata
 from facediff.errors import FaceDiffError
 from facediff.utils.numerics import Array, smooth_step
 
-RAMP = 0.08
-"""Seconds in which lips come together, and part again."""
-
-BUDGET = 12.0
-"""Largest displacement of a vertex in millimetres, by default."""
-
-LEAST = 1e-4
-"""Opening in metres below which the animation does not show how the face opens its mouth."""
+RAMP = 0.08  # Seconds in which lips come together, and part again
+BUDGET = 12.0  # Largest displacement of a vertex in millimetres, by default
+LEAST = 1e-4  # Opening in metres below which the animation does not show how the face opens its mouth
 
 
 def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], budget: float = BUDGET) -> Animation:
@@ -65,19 +60,15 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     # Lips pressed together more firmly than at rest are left as they are.
     excess = np.maximum(opening, 0) / per_unit
     reach = float(np.linalg.norm(shape, axis=-1).max()) or 1.0
-    amounts = np.zeros(len(excess))
-    for bump in bumps:
-        amount = bump * excess
-        largest = amount.max(initial=0) * reach
-        amounts = np.maximum(amounts, amount * min(1.0, budget / 1000 * metre / largest) if largest else 0)
-    changed = np.flatnonzero(amounts)
-    if not len(changed):
+    amounts = bumps * excess
+    largest = np.maximum(amounts.max(axis=1, keepdims=True) * reach, 1e-12)
+    amounts = (amounts * np.minimum(1.0, budget / 1000 * metre / largest)).max(axis=0)
+    if not amounts.any():
         return animation
     vertices = copied(animation.vertices)
-    moved = 0.0
-    for frame in changed:
+    for frame in np.flatnonzero(amounts):
         vertices[frame] -= (amounts[frame] * shape).astype(np.float32)
-        moved = max(moved, amounts[frame] * reach)
+    moved = float(amounts.max()) * reach
     note = f"lips closed at {len(bumps)} p, b, m (moved by up to {1000 * moved / metre:.1f} mm)"
     return with_metadata(animation, vertices, EDITED, note)
 

@@ -6,6 +6,7 @@ docs/animation_controls.md describes; and the curves between keys.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -48,19 +49,12 @@ COLUMNS = ("time", "channel", "value", "interpolation", "slope")
 
 @dataclass(frozen=True)
 class Channel:
-    """Something that can be directed over time.
+    """Something that can be directed over time."""
 
-    Attributes:
-        range: the numbers that it takes; None for a text, as of ``--style``.
-        regions: whether it can be set for a region of the face alone, ``expressiveness.lips``.
-        parts: other names that may follow the dot.
-        in_model: whether it controls the model; else it changes finished motion.
-    """
-
-    range: Range | None
-    regions: bool = False
-    parts: tuple[str, ...] = ()
-    in_model: bool = False
+    range: Range | None  # the numbers that it takes; None for a text, as of ``--style``
+    regions: bool = False  # whether it can be set for a region of the face alone, ``expressiveness.lips``
+    parts: tuple[str, ...] = ()  # other names that may follow the dot
+    in_model: bool = False  # whether it controls the model; else it changes finished motion
 
 
 CHANNELS: dict[str, Channel] = {
@@ -92,12 +86,11 @@ def channel_of(name: str) -> Channel:
     """
     first, dot, part = name.partition(".")
     channel = CHANNELS.get(first)
-    known_names = [channel_name for channel_name in CHANNELS if not CHANNELS[channel_name].parts]
-    known_names += [f"{channel_name}.{part}" for channel_name in CHANNELS for part in CHANNELS[channel_name].parts]
-    fits = channel is not None and (part in channel.parts if channel.parts else not dot or (channel.regions and part))
-    if channel is None or not fits:
-        raise FaceDiffError(f"channel {shown(name)}: {choices(name, known_names)}")
-    return channel
+    if channel and (part in channel.parts if channel.parts else not dot or (channel.regions and part)):
+        return channel
+    known = [known for known in CHANNELS if not CHANNELS[known].parts]
+    known += [f"{known}.{part}" for known in CHANNELS for part in CHANNELS[known].parts]
+    raise FaceDiffError(f"channel {shown(name)}: {choices(name, known)}")
 
 
 @dataclass(frozen=True)
@@ -162,11 +155,9 @@ class Direction:
         if not 0 < len(self.keys) <= MOST_KEYS:
             raise FaceDiffError(f"{self.source}: holds {len(self.keys)} keys; expected 1 to {MOST_KEYS}")
         ordered = sorted(self.keys, key=lambda key: key.time)
-        times: set[tuple[str, float]] = set()
-        for key in ordered:
-            if (key.channel, key.time) in times:
-                raise FaceDiffError(f"{self.source}: time {key.time:g}: {key.channel} has two keys; keep one of them")
-            times.add((key.channel, key.time))
+        channel, times = max(Counter((key.channel, key.time) for key in ordered).items(), key=lambda pair: pair[1])
+        if times > 1:
+            raise FaceDiffError(f"{self.source}: time {channel[1]:g}: {channel[0]} has two keys; keep one of them")
         object.__setattr__(self, "keys", tuple(ordered))
         object.__setattr__(self, "instead_of", tuple(dict.fromkeys(self.instead_of)))
 

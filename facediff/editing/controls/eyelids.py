@@ -24,7 +24,6 @@ MEET = 0.12  # Where the lids meet, from the lower (0) to the upper edge (1): th
 AHEAD = 0.025
 """The shut upper lid lies further out by this share of the eye's width: its way is straight, the eyeball is round."""
 REACH = 0.4  # How far from the edges the skin follows, as a share of the eye's width
-KEYS = "neutral", "blinks", "lids", "eyeballs", "brows"
 PLAUSIBLE = (0.002, 0.2)  # The largest way of a lid, as a share of the face's size (the diagonal of its box)
 SAME_FACE = 1e-3  # Metres that a face may differ from a puppet's to count as that puppet's
 
@@ -82,7 +81,8 @@ def read_eyes(path: Path, template: Floats) -> Eyes:
     if record.brows:
         entries = record.brows if any(isinstance(entry, str | list) for entry in record.brows) else [list(record.brows)]
         brows = np.unique(np.concatenate([_indices(path, entry, count) for entry in entries]))
-    size, closing = float(np.linalg.norm(np.ptp(template, axis=0))), np.zeros((1, 3))
+    size = float(np.linalg.norm(np.ptp(template, axis=0)))
+    closing: Floats = np.zeros((1, 3))
     if record.blinks:
         neutral = _read_shape(path, record.neutral) if record.neutral else None
         with damaged(f"eyes {path}", 'give shapes of this face, and the open face of the same mesh as "neutral"'):
@@ -94,10 +94,6 @@ def read_eyes(path: Path, template: Floats) -> Eyes:
     elif record.lids:
         edges = [(_indices(path, lid.upper, count, 2), _indices(path, lid.lower, count, 2)) for lid in record.lids]
         closing = closing_of_lids(template, edges, np.concatenate(balls) if balls else None)
-    elif not balls and brows is None:
-        raise OptionError.naming(
-            f"{{eyes}} {path}: says nothing of lids or eyeballs, nor of brows; known are {', '.join(KEYS)}"
-        )
     else:
         return Eyes(None, balls, f"eyes {path}", brows)
     longest = float(np.linalg.norm(closing, axis=-1).max())

@@ -99,7 +99,7 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
     parts = []
     for key, columns in (entry.arrays or {}).items():
         with damaged(f"{path}: {key}", "expected numbers (frames, channels)"):
-            array = np.asarray(content[key], np.float64).reshape(content[key].shape[-2:])
+            array: npt.NDArray[Any] = np.asarray(content[key], np.float64).reshape(*content[key].shape[-2:])
         # Exact for arrays that belong to the layout alone; SMPL-X's poses have the body's joints around the jaw.
         if array.shape[1] < columns.stop or (columns.start == 0 and array.shape[1] != columns.stop):
             raise FaceDiffError(
@@ -121,9 +121,7 @@ def _read_archive(path: Path, layout: str | None, frame_rate: float | None) -> P
 
 def _rate(path: Path, given_rate: float | None, entry: Layout, stated: float | None = None) -> float:
     rate = given_rate or stated or entry.frame_rate
-    if rate is None:
-        raise FaceDiffError(f"{path}: its layout has no rate of its own; give the frame rate of the video")
-    return rate
+    return check_number(path, "frame rate", rate, *FRAME_RATES, remedy="give the frame rate of the video")
 
 
 def _clip(

@@ -10,8 +10,7 @@ import numpy as np
 
 from facediff.errors import FaceDiffError, damaged
 from facediff.spaces.arkit import ARKIT
-from facediff.spaces.files.clips import ParameterClip, checked, refuse_gaps
-from facediff.spaces.files.csv_files import rate_of
+from facediff.spaces.files.clips import ParameterClip, checked, rate_of
 from facediff.spaces.layouts import LAYOUTS, layout
 from facediff.spaces.space import Space
 from facediff.utils.hints import check_number
@@ -34,20 +33,19 @@ def read_beat(path: Path) -> ParameterClip:
     space = _space(path, list(map(str, names)))
     metadata = content.get("metadata")
     stated = metadata.get("fps") if isinstance(metadata, dict) else None
-    times = _times(path, frames)
-    if stated is None and times is not None and len(times) > 1:
-        rate = rate_of(times)
-    else:
-        rate = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
-    if times is not None:
-        refuse_gaps(path, times, rate, [f"frame {number}" for number in range(len(times))])
-    start = 0.0 if times is None or not len(times) else float(times[0])
-    after = None if times is None else times - start
-    if after is not None and np.abs(after - np.arange(len(after)) / rate).max(initial=0.0) < 0.25 / rate:
-        after = None  # evenly spaced: nothing was dropped
-    clip = ParameterClip(path.stem, checked(path, values, rate), space, rate, after, start)
+    seconds = [frame.get("time") for frame in frames]
+    timed = len(seconds) > 0 and None not in seconds
+    if stated is not None or not timed or len(seconds) < 2:
+        stated = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
+    rate, start, after = stated, 0.0, None
+    if timed:
+        times = np.array([check_number(path, "time", time, 0, remedy=REMEDY) for time in seconds])
+        rate = rate_of(path, times, [f"frame {number}" for number in range(len(times))], stated)
+        start, after = float(times[0]), times - times[0]
+        if np.abs(after - np.arange(len(after)) / rate).max() < 0.25 / rate:
+            after = None  # evenly spaced: nothing was dropped
     order = next((name for name, entry in LAYOUTS.items() if entry.space.channels == space.channels), "")
-    return replace(clip, layout=order)
+    return ParameterClip(path.stem, checked(path, values, rate), space, rate, after, start, layout=order)
 
 
 def _space(path: Path, names: list[str]) -> Space:
@@ -61,17 +59,6 @@ def _space(path: Path, names: list[str]) -> Space:
         raise FaceDiffError(f"{path}: has the names {quoted(beyond or names)}; expected ARKit's, each once")
     lacking = tuple(name for name in ARKIT if name.casefold() not in folded)
     return replace(layout("arkit"), channels=tuple(names), absent=lacking)
-
-
-def _times(path: Path, frames: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
-    stated = [frame.get("time") for frame in frames]
-    if any(time is None for time in stated):
-        return None
-    times = np.array([check_number(path, "time", time, 0, remedy=REMEDY) for time in stated])
-    if (np.diff(times) <= 0).any():
-        row = int(np.argmax(np.diff(times) <= 0)) + 1
-        raise FaceDiffError(f"{path}: frame {row} is no later than the one before it; write it again")
-    return times
 
 
 def write_beat(path: Path, clip: ParameterClip) -> None:

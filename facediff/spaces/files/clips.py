@@ -21,6 +21,10 @@ Values = npt.NDArray[np.float32]
 MOST_MISSING = 3600
 """Frames that may be missing between two rows, a minute at 60 a second; they are interpolated."""
 
+USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
+NEAR_RATE = 0.01
+"""Share by which the rate of rows may differ from a usual one and still be it."""
+
 LARGEST = 1e6
 """Largest absolute value of a channel; weights, radians and coefficients in standard deviations are far below."""
 
@@ -81,15 +85,28 @@ def columns_of(path: Path, header: Sequence[str], space: Space) -> list[int]:
         return [columns[name] for name in space.channels]
 
 
-def refuse_gaps(path: Path, times: Array, frame_rate: float, places: Sequence[str]) -> None:
-    """Refuse times (T,) between which more frames are missing than a recorder drops; ``places`` name the rows."""
-    missing = np.diff(times) * frame_rate
-    if len(missing) and missing.max() > MOST_MISSING:
-        at = int(missing.argmax())
+def rate_of(path: Path, times: Array, places: Sequence[str], stated: float | None = None) -> float:
+    """Rows a second, as stated or by the median step between times (T,): a usual rate where it is near one.
+
+    The number of rows says nothing, since recorders drop some. Times must ascend, with no more rows missing than a
+    recorder drops; ``places`` name the rows.
+    """
+    later = np.isfinite(times) & (np.diff(times, prepend=-np.inf) > 0)
+    if not later.all() or (stated is None and len(times) < 2):
+        row = places[int(np.argmin(later))] if len(times) else "the table"
+        raise FaceDiffError(f"{path}: {row} is no later than the one before it, or alone; expected times that ascend")
+    if stated is None:
+        measured = 1.0 / float(np.median(np.diff(times)))
+        nearest = min(USUAL_RATES, key=lambda rate: abs(rate - measured))
+        stated = nearest if abs(measured / nearest - 1) < NEAR_RATE else round(measured, 3)
+    steps = np.diff(times)
+    if steps.max(initial=0.0) * stated > MOST_MISSING:
+        at = int(steps.argmax())
         raise FaceDiffError(
-            f"{path}: {places[at + 1]} comes {times[at + 1] - times[at]:.0f} s after {places[at]}; cut the recording "
-            f"there, or correct its time"
+            f"{path}: {places[at + 1]} comes {steps[at]:.0f} s after {places[at]}; cut the recording there, or correct "
+            f"its time"
         )
+    return stated
 
 
 def shortest(value: np.float32) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from facediff.errors import FaceDiffError, damaged, note
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
-from facediff.spaces.files.clips import ParameterClip, checked, columns_of, refuse_gaps, shortest
+from facediff.spaces.files.clips import ParameterClip, checked, columns_of, rate_of, shortest
 from facediff.spaces.layouts import layout
 from facediff.spaces.operations import permuted
 from facediff.utils.files import atomic
@@ -28,9 +28,6 @@ SIXTIETHS = 60
 """Unit of the last field of a timecode, as parts of a second; it does not depend on the recorded rate."""
 TIMECODE_RATES = (24, 25, 30, 48, 50)
 """Frames a second that programs count in that field."""
-USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
-NEAR_RATE = 0.01
-"""Share by which the rate of a table's rows may differ from a usual one and still be it."""
 _MIRRORED = np.array([not name.endswith("Pitch") for name in ROTATIONS])
 """The app's rotations with the opposite sign of a right-handed face that looks along +z.
 
@@ -96,27 +93,6 @@ def _clock(path: Path, stamps: Array) -> Array:
     return np.asarray(seconds + parts / unit)
 
 
-def rate_of(times: Array) -> float:
-    """Rows a second by the median step between times (T,): a usual rate where it is near one, else as measured.
-
-    The number of rows says nothing, since the app drops some.
-    """
-    measured = 1.0 / float(np.median(np.diff(times)))
-    nearest = min(USUAL_RATES, key=lambda rate: abs(rate - measured))
-    return nearest if abs(measured / nearest - 1) < NEAR_RATE else round(measured, 3)
-
-
-def _rate(path: Path, times: Array, numbers: Sequence[int]) -> float:
-    """The rate of rows with these numbers; refuses times that do not ascend."""
-    later = np.isfinite(times) & (np.diff(times, prepend=-np.inf) > 0)
-    if len(times) < 2 or not later.all():
-        row = f"row {numbers[int(np.argmin(later))]}" if len(times) else "the table"
-        raise FaceDiffError(f"{path}: {row} is no later than the one before it, or alone; expected times that ascend")
-    rate = rate_of(times)
-    refuse_gaps(path, times, rate, [f"row {number}" for number in numbers])
-    return rate
-
-
 def gaze(names: Sequence[str], weights: Values) -> Array:
     """Rotations of the left and the right eye (T, 6) that weights of ``eyeLook`` shapes stand for.
 
@@ -171,7 +147,7 @@ def read_live_link(path: Path) -> ParameterClip:
         numbers.append(number)
         values.append(_numbers(path, number, [*row, *("0" for _ in lacking)], columns, len(header)))
     clock = _clock(path, np.array(times).reshape(-1, 2))
-    rate = _rate(path, clock, numbers)
+    rate = rate_of(path, clock, [f"row {number}" for number in numbers])
     table = checked(path, np.array(values), rate)
     table[:, len(ARKIT) :] = mirrored(table[:, len(ARKIT) :])
     space = replace(space, absent=(*space.absent, *lacking))
@@ -222,7 +198,7 @@ def read_audio2face(path: Path) -> ParameterClip:
     ]
     table = np.array(cells).reshape(len(cells), -1)
     clock = table[:, 0] if len(table) else np.zeros(0)
-    rate = _rate(path, clock, range(2, len(clock) + 2))
+    rate = rate_of(path, clock, [f"row {number}" for number in range(2, len(clock) + 2)])
     values, space = checked(path, table[:, 1:], rate), replace(space, absent=tuple(lacking))
     return ParameterClip(path.stem, values, space, rate, clock - clock[0], float(clock[0]), layout="audio2face")
 

@@ -29,7 +29,8 @@ def read_parameters(path: str | Path, *, layout: str | None = None, frame_rate: 
         frame_rate: frames a second of an array, where its layout states none.
     """
     path = Path(from_home(path))
-    suffix = _suffix(path, SUFFIXES)
+    suffix = path.suffix.lower()
+    check_known(path, "format", [suffix], SUFFIXES)
     if suffix in ARRAYS:
         return read_array(path, layout, frame_rate)
     refuse_idle(f"{path} names its columns itself", layout=layout is not None)
@@ -48,16 +49,11 @@ def write_parameters(path: str | Path, clip: ParameterClip, *, layout: str = "")
         layout: of a ``.npy`` or ``.npz``; the clip's own if empty.
     """
     path = Path(path)
-    suffix = _suffix(path, (".csv", ".json", ".npy", ".npz"))
+    suffix = path.suffix.lower()
+    check_known(path, "format", [suffix], (".csv", ".json", ".npy", ".npz"))
     if suffix == ".csv":
         write_live_link(path, clip)
     elif suffix == ".json":
         write_beat(path, clip)
     else:
         write_array(path, clip, layout)
-
-
-def _suffix(path: Path, suffixes: tuple[str, ...]) -> str:
-    """A path's suffix in lower case; refused if it is none of these."""
-    check_known(path, "format", [path.suffix.lower()], suffixes)
-    return path.suffix.lower()
