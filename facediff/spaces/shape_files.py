@@ -84,16 +84,14 @@ def read_shape_files(path: Path, vertices: int | None = None) -> ShapeFiles:
                 f"{len(first.vertices)}; expected shapes of one mesh with the order of its vertices kept"
             )
     names, moves, notes = [file.stem for file in shapes], [mesh.vertices for mesh in meshes[len(rest) :]], []
-    for name in HALVED if rest and plain(rest[0].stem) == ICT_NEUTRAL else ():
-        halves = [f"{name}_L", f"{name}_R"]
-        if all(half in names for half in halves):
-            left, right = (moves[names.index(half)] for half in halves)
-            rows = [row for row, other in enumerate(names) if other not in halves]
-            names, moves = (
-                [*(names[k] for k in rows), name],
-                [*(moves[k] for k in rows), left + right - first.vertices],
-            )
-            notes.append(f"{name} is the sum of its halves {' and '.join(halves)}")
+    if rest and plain(rest[0].stem) == ICT_NEUTRAL:
+        joined = dict(zip(names, moves, strict=True))
+        for name in HALVED:
+            halves = [f"{name}_L", f"{name}_R"]
+            if all(half in joined for half in halves):
+                joined[name] = joined.pop(halves[0]) + joined.pop(halves[1]) - first.vertices
+                notes.append(f"{name} is the sum of its halves {' and '.join(halves)}")
+        names, moves = list(joined), list(joined.values())
     return ShapeFiles(
         path,
         files[0],
