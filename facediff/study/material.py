@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.archives import AnimationFacts, read_animation
+from facediff.data.check.findings import few
 from facediff.data.corpus import MOTION_FOLDERS
 from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.gather import gather
-from facediff.evaluation.figures.material import few
 from facediff.evaluation.file_pairs import DEFAULT_PATTERNS, OWN, NamePattern
 from facediff.mesh import read_mesh
 from facediff.speech.audio import CONTAINERS, SUFFIXES, read_sound_to_play
@@ -144,7 +144,7 @@ class StudyAnimations:
         self.clips = sorted(set.intersection(*sets))
         self.left_out = {name: sorted(set(files) - set(self.clips)) for name, files in self._files.items()}
         if not self.clips:
-            clips = "; ".join(f"{name} has {few(dict.fromkeys(sorted(files)))}" for name, files in self._files.items())
+            clips = "; ".join(f"{name} has {few(sorted(files))}" for name, files in self._files.items())
             raise FaceDiffError(
                 f"there is no common clip: {clips}. Name files alike: <clip>.npz, <clip>.npy or "
                 f"<clip>_condition_<identity>.npy"

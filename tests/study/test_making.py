@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import pytest
 
 from facediff.animation import read_archive, write_archive
 from facediff.cli.app import main
-from facediff.render import video as encoding
+from facediff.render import write_video
 from facediff.study import read_study
 from facediff.study.definition import DATABASE, Trial
 from facediff.study.store import AnswerStore
@@ -183,15 +183,17 @@ def test_a_study_with_answers_is_not_replaced(place: Path, refused: Callable[...
 def test_a_full_disk_leaves_no_study_and_the_next_run_continues(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real, count = encoding._encode, iter(range(100))
+    count = iter(range(100))
 
-    def full(*arguments: object) -> int:
-        if next(count) >= 3:
-            raise OSError(28, "No space left on device")
-        return real(*arguments)  # type: ignore[arg-type]
+    def ended(pictures: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+        yield next(pictures)
+        raise OSError(28, "No space left on device")
+
+    def full(path: Path, pictures: Iterator[np.ndarray], *more: object) -> int:
+        return write_video(path, pictures if next(count) < 3 else ended(pictures), *more)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch:
-        patch.setattr(encoding, "_encode", full)
+        patch.setattr("facediff.study.making.write_video", full)
         assert make(*FEW) == 2
     assert "No space" in capsys.readouterr().err
     assert not (place / "study" / "study.json").exists()

@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from facediff.data.check.findings import few
 from facediff.data.corpus import ALL
-from facediff.errors import FaceDiffError, check_known, choices
+from facediff.errors import FaceDiffError, check_known
 from facediff.evaluation.file_pairs import (
     DEFAULT_PATTERNS,
     OWN,
@@ -29,7 +30,6 @@ from facediff.render.rasteriser import FIELD_OF_VIEW
 
 TRUTH = "truth"  # Name of the truth in a figure
 CHUNK = 2**20  # Coordinates that are converted to float64 together: 8 MB, however long a clip is
-LISTED = 12  # The most clips that a message names
 WHITE = (1.0, 1.0, 1.0)
 
 SHADED = Look(lights=EVEN, background_top=WHITE, background_bottom=WHITE)
@@ -161,18 +161,6 @@ def find_clips(
             )
         predictions[method] = {pair.clip: next(iter(pair.predictions.values())) for pair in pairs}
     return truths, predictions
-
-
-def few(clips: Mapping[str, object], like: str = "") -> str:
-    """The names of clips for a message: all, or a few of many, the most similar to a name first."""
-    import difflib
-
-    if len(clips) <= LISTED:
-        return choices(like, clips) if like else ", ".join(clips)
-    near = difflib.get_close_matches(like, clips, n=LISTED, cutoff=0.3) if like else []
-    if near:
-        return f'did you mean "{near[0]}"? near are {", ".join(near)} of {len(clips)}'
-    return f"{', '.join(list(clips)[:LISTED])} … ({len(clips)} in all)"
 
 
 def shortest(motions: Mapping[str, Tensor]) -> tuple[int, str | None]:
