@@ -118,9 +118,7 @@ from facediff.metrics.timing import warp as warp
 from facediff.metrics.vertex_errors import FaceDynamicsDeviation as FaceDynamicsDeviation
 from facediff.metrics.vertex_errors import LipVertexError as LipVertexError
 from facediff.metrics.vertex_errors import MeanVertexError as MeanVertexError
-from facediff.metrics.vertex_errors import UpperFaceVertexError as UpperFaceVertexError
 from facediff.metrics.vertex_errors import VertexError as VertexError
 from facediff.metrics.vertex_errors import face_dynamics_deviation as face_dynamics_deviation
 from facediff.metrics.vertex_errors import lip_vertex_error as lip_vertex_error
 from facediff.metrics.vertex_errors import mean_vertex_error as mean_vertex_error
-from facediff.metrics.vertex_errors import upper_face_vertex_error as upper_face_vertex_error

@@ -15,7 +15,7 @@ from torch import Tensor
 from facediff.metrics.base import Clip, SequenceOptions, check_option, check_range, functional
 from facediff.metrics.generation import RatioMetric
 from facediff.metrics.mouth import OpeningMetric
-from facediff.metrics.regions import EyelidPairs, LipPairs, LipPairsLike
+from facediff.metrics.regions import LipPairsLike
 from facediff.registry import metric
 
 CLOSED, REOPENED = 0.5, 0.3
@@ -41,20 +41,10 @@ def count_blinks(opening: Tensor, *, closed: float = CLOSED, reopened: float = R
 
 
 class LidMetric(OpeningMetric, RatioMetric):
-    """Base of metrics of the eyelids.
-
-    Args:
-        pairs: upper and lower eyelid vertices, :class:`EyelidPairs` or pairs of indices.
-        definition: the metric in words.
-    """
+    """Base of metrics of the eyelids, by upper and lower eyelid vertices, :class:`EyelidPairs` or pairs of indices."""
 
     needs: ClassVar[tuple[str, ...]] = ("lid_pairs",)
-
-    def __init__(self, pairs: LipPairsLike, *, definition: str, **options: Unpack[SequenceOptions]) -> None:
-        if not isinstance(pairs, EyelidPairs):
-            bare = pairs.pairs if isinstance(pairs, LipPairs) else pairs
-            pairs = EyelidPairs.from_pairs("eyelid pairs", bare)
-        super().__init__(pairs, definition=definition, **options)
+    pairs_name = "eyelid pairs"
 
 
 class BlinkMetric(LidMetric):

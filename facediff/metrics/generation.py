@@ -289,23 +289,17 @@ class SpreadErrorRatio(OfSamples, RatioMetric):
 spread_error_ratio = functional(SpreadErrorRatio)
 
 
-Unit = Literal["frames", "sequences"]
-"""The vector of an energy score: all coordinates of a frame, or of a whole sequence."""
-
-
 @metric.register("energy_score")
 class EnergyScore(OfSamples):
     """Energy score: a proper score of samples against the truth; no collapsed or over-dispersed model can win it.
 
     ES = mean_i ‖x_i − y‖ − ½ mean_{i≠j} ‖x_i − x_j‖, the multivariate form of the continuous ranked probability score
     (Gneiting and Raftery 2007, eq. 22), unbiased in the number of samples. Vectors are all coordinates of a region in
-    one frame, divided by the square root of the number of vertices so that regions compare; or with ``of="sequences"``
-    the coordinates of all frames, which also sees whether samples move as the truth does over time. In the vertices'
-    unit; lower is better. With a single sample of a deterministic model it is the distance itself.
+    one frame, divided by the square root of the number of vertices so that regions compare. In the vertices' unit;
+    lower is better. With a single sample of a deterministic model it is the distance itself.
 
     Args:
         n_samples: how many samples there are of each sequence; other numbers are refused.
-        of: ``"frames"`` or ``"sequences"``.
         pooling: ``"frames"`` or ``"sequences"``.
 
     >>> import torch
@@ -322,14 +316,11 @@ class EnergyScore(OfSamples):
         region: RegionLike | None = None,
         *,
         n_samples: int = 4,
-        of: Unit = "frames",
         pooling: Pooling = "frames",
         **options: Unpack[SequenceOptions],
     ) -> None:
-        check_option("of", of, Unit)
-        definition = f"energy score of {n_samples} samples, vectors being {of} of {{region}}; {{pooling}} [unit]"
+        definition = f"energy score of {n_samples} samples, vectors being frames of {{region}}; {{pooling}} [unit]"
         super().__init__(n_samples=n_samples, definition=definition, pooling=pooling, region=region, **options)
-        self.of: Unit = of
 
     def clip_value(self, clip: Clip) -> Tensor:
         """The score of one sequence, mean over its frames."""
@@ -337,8 +328,7 @@ class EnergyScore(OfSamples):
         count = samples.shape[1]
 
         def distance(first: Tensor, second: Tensor) -> Tensor:
-            squared = (first - second).square().sum((-2, -1)) / first.shape[-2]
-            return squared.sqrt().mean() if self.of == "frames" else squared.mean().sqrt()
+            return ((first - second).square().sum((-2, -1)) / first.shape[-2]).sqrt().mean()
 
         off = torch.stack([distance(sample, truth) for sample in samples.unbind(1)]).mean()
         between = [distance(samples[:, i], samples[:, j]) for i, j in combinations(range(count), 2)]

@@ -30,7 +30,7 @@ from facediff.metrics.base import (
     functional,
 )
 from facediff.metrics.one_pass import frames_per_step, squared_norm
-from facediff.metrics.regions import LipPairs, LipPairsLike, as_lip_pairs
+from facediff.metrics.regions import LipPairs, LipPairsLike
 from facediff.registry import metric
 
 
@@ -91,6 +91,7 @@ class OpeningMetric(SequenceMetric):
     """
 
     needs: ClassVar[tuple[str, ...]] = ("lip_pairs",)
+    pairs_name: ClassVar[str] = "lip pairs"
 
     def __init__(
         self,
@@ -100,7 +101,7 @@ class OpeningMetric(SequenceMetric):
         pooling: Pooling = "sequences",
         **options: Unpack[SequenceOptions],
     ) -> None:
-        lip_pairs = as_lip_pairs(pairs)
+        lip_pairs = pairs if isinstance(pairs, LipPairs) else LipPairs.from_pairs(self.pairs_name, pairs)
         definition = (definition or self.words).replace("{pairs}", str(lip_pairs))
         super().__init__(definition=definition, pooling=pooling, **options)
         self.pairs = lip_pairs

@@ -287,11 +287,6 @@ LipPairsLike = LipPairs | Iterable[Iterable[int]] | Tensor
 """:class:`LipPairs`, or bare pairs of indices, which get a general name."""
 
 
-def as_lip_pairs(pairs: LipPairsLike) -> LipPairs:
-    """The pairs themselves, or named ones from bare indices."""
-    return pairs if isinstance(pairs, LipPairs) else LipPairs.from_pairs("lip pairs", pairs)
-
-
 # Files of indices and of weights.
 
 

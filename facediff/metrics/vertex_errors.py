@@ -1,4 +1,4 @@
-"""Distance of the vertices from the truth (MVE, LVE, UVE), and how much the upper face moves (FDD).
+"""Distance of the vertices from the truth (MVE, LVE), and how much the upper face moves (FDD).
 
 g and p are truth and prediction (frames, vertices, 3), and e²[t, v] = Σ_c (g[t, v, c] − p[t, v, c])². The arithmetic,
 in float64 and in one pass over the frames, is in :mod:`facediff.metrics.one_pass`.
@@ -102,12 +102,12 @@ class VertexError(SequenceMetric):
 
 @metric.register("mean_vertex_error")
 class MeanVertexError(VertexError):
-    """Mean vertex error (MVE): mean over frames of the mean or largest √e² over all vertices.
+    """Mean vertex error (MVE): mean over frames of the mean or largest √e² over all vertices, or those of a region.
 
     ``reduction="mean"``, unsquared, pooled by frames is FaceDiffuser's script: mean over frames and vertices
     of √e². ``reduction="max"`` is the text of the dual-path style diffusion paper: the largest √e² of each
     frame, averaged over frames. In the vertices' unit, squared if ``squared``. Squared with ``root`` it is what ARTalk
-    and UniLS call MHD.
+    and UniLS call MHD. Over the upper face it counts, unlike FDD, a brow that moves at the wrong moment.
 
     >>> import torch
     >>> metric = MeanVertexError()
@@ -115,15 +115,6 @@ class MeanVertexError(VertexError):
     >>> round(metric.compute().item(), 6), metric.coverage().frames
     (1.732051, 9)
     """
-
-    def __init__(
-        self,
-        *,
-        reduction: Reduction = "mean",
-        squared: bool = False,
-        **options: Unpack[VertexOptions],
-    ) -> None:
-        super().__init__(None, reduction=reduction, squared=squared, **options)
 
 
 mean_vertex_error = functional(MeanVertexError)
@@ -156,36 +147,6 @@ class LipVertexError(VertexError):
 
 
 lip_vertex_error = functional(LipVertexError)
-
-
-@metric.register("upper_face_vertex_error")
-class UpperFaceVertexError(VertexError):
-    """Upper-face vertex error (UVE): how far the vertices of the upper face are from the truth.
-
-    The mean over frames of the mean (or largest) distance √e² over the upper-face vertices: what MVE is for
-    the whole mesh. There is no usual formula of that name; the mean of unsquared distances is a choice, and
-    ``reduction="max", squared=True`` is what LVE's formula gives on this region. Unlike FDD it distinguishes a brow
-    that moves at the wrong moment from one that moves correctly, and so counts against a face with an upper part that
-    is plausible but not the truth's. In the vertices' unit, squared if ``squared``.
-
-    Args:
-        upper: upper-face vertices, a :class:`Region` or indices.
-    """
-
-    needs = ("upper_face",)
-
-    def __init__(
-        self,
-        upper: RegionLike,
-        *,
-        reduction: Reduction = "mean",
-        squared: bool = False,
-        **options: Unpack[VertexOptions],
-    ) -> None:
-        super().__init__(as_region(upper, "upper"), reduction=reduction, squared=squared, **options)
-
-
-upper_face_vertex_error = functional(UpperFaceVertexError)
 
 
 def dynamics_words(*, sign: Sign, scale: float = 1.0) -> str:

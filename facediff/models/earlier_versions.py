@@ -41,6 +41,7 @@ REMOVED: dict[str, dict[str, Any]] = {
     "facediff.models.published.facediffuser.FaceDiffuser": {"encode_speech": ANY, "alignment": "auto"},
     "facediff.models.published.diffspeaker.DiffSpeaker": {
         **{"time_dim": ANY, "loss_mean": "padded", "unknown_speaker": "first", "alignment": "interpolated"},
+        "sampling_space": ANY,
     },
     "facediff.models.published.selftalk.SelfTalk": {"lip_heads": 8, "alignment": "auto"},
     "facediff.models.published.voca.Voca": {

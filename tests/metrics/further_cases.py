@@ -414,13 +414,12 @@ def variance_over_error(corpus: Corpus, *, region: Sequence[int]) -> float:
     return (1 + 1 / SAMPLES) * variance / error
 
 
-def energy(corpus: Corpus, place: int, *, of: str, region: Sequence[int]) -> tuple[float, float]:
+def energy(corpus: Corpus, place: int, *, region: Sequence[int]) -> tuple[float, float]:
     x = several(corpus, place).astype(np.float64)[:, :, list(region)]
     g = corpus.truths[place].astype(np.float64)[:, list(region)]
 
     def distance(a: Array, b: Array) -> float:
-        squares = ((a - b) ** 2).sum((1, 2)) / len(region)
-        return float(np.sqrt(squares).mean() if of == "frames" else np.sqrt(squares.mean()))
+        return float(np.sqrt(((a - b) ** 2).sum((1, 2)) / len(region)).mean())
 
     off = np.mean([distance(one, g) for one in x])
     return float(off - 0.5 * np.mean([distance(x[a], x[b]) for a, b in combinations(range(SAMPLES), 2)])), len(g)
@@ -501,7 +500,7 @@ def _cases() -> list[Case]:
         shape: dict[str, Any] = {"reduction": reduction, "squared": squared}
         options = shape | {"pooling": pooling}
         expected = pooled(partial(vertex_error, region=UPPER, **shape), pooling)
-        add(fm.UpperFaceVertexError, upper, options, pair_batch, expected)
+        add(fm.MeanVertexError, {"region": UPPER}, options, pair_batch, expected, "region")
         expected = pooled(partial(vertex_error, region=everything, **shape), pooling)
         add(fm.MeanVertexError, {}, options, pair_batch, expected)
     for squared, pooling in product((True, False), poolings):
@@ -561,10 +560,9 @@ def _cases() -> list[Case]:
         for options, ratio in (({}, spread_over_error), ({"squared": True}, variance_over_error)):
             expected = partial(ratio, region=over)
             add(fm.SpreadErrorRatio, of_region, options, samples_batch, expected, word, several_samples)
-        for of, pooling in product(("frames", "sequences"), poolings):
-            expected = pooled(partial(energy, of=of, region=over), pooling)
-            options = {"of": of, "pooling": pooling}
-            add(fm.EnergyScore, of_region, options, samples_batch, expected, word, several_samples)
+        for pooling in poolings:
+            expected = pooled(partial(energy, region=over), pooling)
+            add(fm.EnergyScore, of_region, {"pooling": pooling}, samples_batch, expected, word, several_samples)
     of_lips = {"region": LIPS}
     for of in subjects:
         for cls, options, score in (

@@ -71,7 +71,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
         "DiffSpeaker",
         {**DIFFSPEAKER, **OWN, "audio_encoder": "wav2vec2", "scheduler": "ddim", "smooth": False},
     ),
-    "DiffSpeaker, vertices": ("DiffSpeaker", {**DIFFSPEAKER, "sampling_space": "vertices"}),
     "Voca": ("Voca", VOCA),
     "Voca at 25, DeepSpeech": ("Voca", {**VOCA, **OWN, "audio_encoder": "deepspeech"}),
     "Voca at 60, DeepSpeech": ("Voca", {**VOCA, **OWN, "audio_encoder": "deepspeech", "frame_rate": 60.0}),

@@ -207,10 +207,8 @@ class CodeTalker(AutoregressiveModel):
             )
         with damaged("--model.prior", "give a checkpoint of CodeTalker"):
             trained = load_model(path)
-        model_facts, trained_facts = (
-            self.prior_facts(),
-            trained.prior_facts() if isinstance(trained, CodeTalker) else {},
-        )
+        model_facts = self.prior_facts()
+        trained_facts = trained.prior_facts() if isinstance(trained, CodeTalker) else {}
         if differing := [name for name in model_facts if model_facts[name] != trained_facts.get(name)]:
             raise FaceDiffError(
                 f"--model.prior {path}: is of {type(trained).__name__} with {differing[0]} "
@@ -250,13 +248,8 @@ class CodeTalker(AutoregressiveModel):
     def prior_facts(self) -> dict[str, object]:
         """What two models must agree on to have the same prior, by the names of the options."""
         facts = {"n_vertices": self.n_vertices, "frame_rate": self.frame_rate, "motion_scale": self.motion_scaling}
-        sizes = {name: value for name, value in self.prior_options.items() if name not in ("dim", "num_layers")}
-        return {
-            **facts,
-            **sizes,
-            "prior_dim": self.prior_options["dim"],
-            "prior_layers": self.prior_options["num_layers"],
-        }
+        names = {"dim": "prior_dim", "num_layers": "prior_layers"}
+        return facts | {names.get(name, name): value for name, value in self.prior_options.items()}
 
     # Training.
 

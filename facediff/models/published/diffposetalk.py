@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.data import Batch
-from facediff.errors import ArgumentError, OptionError, check_known
+from facediff.errors import OptionError, check_known
 from facediff.models.audio_encoders import AudioEncoderFactory
 from facediff.models.inference import BatchMotion, Progress
 from facediff.models.layers import Heads, Layers, Share, Width, check_heads
@@ -39,7 +39,7 @@ from facediff.models.published.diffposetalk_network import (
     clamped,
     guided,
 )
-from facediff.models.published.diffusion import PosteriorSampler, SeededNoise
+from facediff.models.published.diffusion import PosteriorSampler, seeded_noise
 from facediff.models.published.import_options import ImportOptions
 from facediff.models.published.parametric import ParametricModel, statistics_of, window_at
 from facediff.models.samplers import NoiseSource
@@ -113,10 +113,6 @@ class DiffPoseTalk(ParametricModel):
     ) -> None:
         super().__init__(shape_dim=shape_dim, head=head, **options)
         check_heads(dim=dim, num_heads=num_heads, even=True)
-        if context > window_frames:
-            raise ArgumentError(
-                {"context": context, "window_frames": window_frames}, "a window must hold the context of the next"
-            )
         self.window_frames, self.context = window_frames, context
         self.guiding: tuple[Condition, ...] = tuple(name for name in ("audio", "style") if name in conditions)
         self.guidance: Guidance = guidance
@@ -323,7 +319,7 @@ class DiffPoseTalk(ParametricModel):
         rows = []
         for i, seed in enumerate(seeds):
             audio = batch.audio[i, : int(batch.audio_lengths[i])]
-            draw = SeededNoise([self.window_frames], [seed], self.device)
+            draw = seeded_noise([self.window_frames], [seed], self.device)
             motion = self.sample(audio, shapes[i : i + 1], None if style is None else style[i : i + 1], draw, progress)
             rows.append(self.absolute(motion))
         motion = nn.utils.rnn.pad_sequence(rows, batch_first=True)

@@ -30,7 +30,7 @@ from facediff.models.layers import AttentionContext, Heads, Layers, Share, Width
 from facediff.models.published.autoregressive import Period, SpeechDecoderLayer
 from facediff.models.published.base import TRAINED_NETWORK, LongSpeech, SpeakerTable, still_map
 from facediff.models.published.diffusion import DiffusionModel, diffusion_graphs
-from facediff.models.published.positions import periodic_positions
+from facediff.models.published.positions import distance_bias, periodic_positions
 from facediff.models.samplers import NoiseProcess, NoiseSource, Sampler
 from facediff.models.squared_errors import squared_errors
 from facediff.speech.windows import FrameClock
@@ -57,8 +57,6 @@ class DiffSpeaker(DiffusionModel):
         scheduler: ``published`` is DDIM as diffusers 0.11 had it, which takes the predicted clean motion for the
             predicted noise where it goes to the next step; ``ddim`` computes that noise, as the paper of DDIM does.
         sampling_steps: denoising steps, at most 1000.
-        sampling_space: where sampling runs: ``folded`` into the first map's width, or on the ``vertices``, as
-            published; only rounding differs.
         smooth: take the mean of each frame, the one before and the one after it; at 30 frames a second (VOCASET) if
             None, as published.
         long_speech: for more than 3000 frames the published tables have no rows: ``refuse``
@@ -73,6 +71,7 @@ class DiffSpeaker(DiffusionModel):
     interpolates: ClassVar[bool] = True
     network: DiffSpeakerNetwork
     fresh_noise: ClassVar[bool] = False
+    sampling_space: SamplingSpace = "folded"  # the same motion for the same noise as on vertices, to rounding
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         TRAINED_NETWORK, source="facebook/hubert-base-ls960", epsilon=1e-7
     )
@@ -88,7 +87,6 @@ class DiffSpeaker(DiffusionModel):
         period: Period | None = None,
         scheduler: Scheduler = "published",
         sampling_steps: Annotated[int, Range(1, TRAINING_STEPS)] = 50,
-        sampling_space: SamplingSpace = "folded",
         smooth: bool | None = None,
         long_speech: LongSpeech = "refuse",
         weight_decay: Decay = 0.01,
@@ -99,7 +97,6 @@ class DiffSpeaker(DiffusionModel):
         check_heads(dim=self.dim, num_heads=num_heads, even=True)
         self.scheduler: Scheduler = scheduler
         self.sampling_steps = sampling_steps
-        self.sampling_space: SamplingSpace = sampling_space
         self.smooth = self.frame_rate == 30.0 if smooth is None else smooth
         self.plan_long_speech(long_speech)
         # Scaled-linear variances from 0.00085 to 0.012, the latent-diffusion schedule that the authors' configuration
@@ -186,16 +183,15 @@ class DiffSpeaker(DiffusionModel):
 
     def graphs(self) -> Graphs:
         """The present scheduler, and the last map with the smoothing; noise is drawn once, on the vertices."""
-        folded = self.sampling_space == "folded"
         return diffusion_graphs(
             self,
             SpeakerStep(self),
             SpeakerMotion(self),
             f"{self.scheduler} DDIM" if self.scheduler == "published" else "ddim",
             drawn=self.coordinates,
-            state=2 * self.dim + 2 if folded else self.coordinates,
-            starts=folded,
-            last_noise=folded and not self.sampler.literal,
+            state=2 * self.dim + 2,
+            starts=True,
+            last_noise=not self.sampler.literal,
         )
 
     @property
@@ -226,8 +222,6 @@ class DiffSpeaker(DiffusionModel):
     def first_state(self, noise: Float[Tensor, "batch frames coordinates"]) -> Float[Tensor, "batch frames state"]:
         """Noise alone, without features and bias."""
         state = self.state_space().project(noise)
-        if self.sampling_space == "vertices":
-            return state
         ones = torch.ones_like(state[..., :1])
         return torch.cat([state, torch.zeros_like(state), torch.zeros_like(ones), ones], -1)
 
@@ -237,18 +231,14 @@ class DiffSpeaker(DiffusionModel):
         """Clean motion as a state, and the features that it is a map of."""
         space = self.state_space()
         hidden = self.network(space.embed(state[..., : space.width]), step, conditions)
-        if self.sampling_space == "vertices":
-            return space.clean(hidden), hidden
         ones = torch.ones_like(hidden[..., :1])
         return torch.cat([space.clean(hidden), hidden, ones, torch.zeros_like(ones)], -1), hidden
 
     def motion_of(self, state: Float[Tensor, "batch frames state"], noise: Tensor | None) -> BatchMotion:
         """Offsets at the end of sampling; ``noise`` is the unit noise of the start, if anything is left of it."""
-        if self.sampling_space == "folded":
-            features, last = state[..., self.dim : -2], self.network.motion_out
-            coordinates = F.linear(features, last.weight) + state[..., -2:-1] * last.bias
-            state = coordinates if noise is None else coordinates + state[..., -1:] * noise
-        return self.offsets_of(state)
+        features, last = state[..., self.dim : -2], self.network.motion_out
+        coordinates = F.linear(features, last.weight) + state[..., -2:-1] * last.bias
+        return self.offsets_of(coordinates if noise is None else coordinates + state[..., -1:] * noise)
 
 
 class SpeakerSampler(Sampler):
@@ -427,9 +417,7 @@ def mutual_bias(
     frames_range = torch.arange(frames, device=device)
     distance = frames_range[:, None] - frames_range
     # The authors flip a causal table to make the other half, which leaves later frames one nearer than earlier ones.
-    distance = torch.where(distance < 0, -distance - 1, distance)
-    slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
-    return -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
+    return distance_bias(torch.where(distance < 0, -distance - 1, distance), heads, period)
 
 
 # The method as graphs, without PyTorch; see facediff.models.graphs.

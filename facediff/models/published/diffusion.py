@@ -33,7 +33,7 @@ from facediff.models.graphs import (
     speech_graph,
     update_table,
 )
-from facediff.models.inference import BatchMotion, Progress
+from facediff.models.inference import BatchMotion, ClipNoise, Progress
 from facediff.models.published.base import PublishedModel, whole_model
 from facediff.models.samplers import NoiseProcess, NoiseSource, Sampler
 
@@ -65,7 +65,7 @@ class DiffusionModel(PublishedModel):
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
         """The reverse process; a clip's noise depends on its seed alone."""
-        return self.sample(batch, frames, SeededNoise(frames.tolist(), seeds, self.device), progress)
+        return self.sample(batch, frames, seeded_noise(frames.tolist(), seeds, self.device), progress)
 
     @abstractmethod
     def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
@@ -132,22 +132,12 @@ class PosteriorSampler(Sampler):
         return of_clean * predictions[-1] + of_noisy * noisy + deviation * noise(noisy)
 
 
-class SeededNoise:
+def seeded_noise(frames: Sequence[int], seeds: Sequence[int], device: torch.device) -> ClipNoise:
     """Unit Gaussian noise as a generator with a clip's seed gives it, zero on the clip's padding.
 
     The clip's name does not enter, unlike in the other models: so a seed gives the published code's noise.
     """
-
-    def __init__(self, frames: Sequence[int], seeds: Sequence[int], device: torch.device) -> None:
-        self.frames = list(frames)
-        self.streams = [torch.Generator(device).manual_seed(seed) for seed in seeds]
-
-    def __call__(self, like: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
-        """The next noise of the shape of ``like``."""
-        noise = torch.zeros_like(like)
-        for row, stream, frames in zip(noise, self.streams, self.frames, strict=True):
-            row[:frames] = torch.randn((frames, like.shape[2]), device=like.device, dtype=like.dtype, generator=stream)
-        return noise
+    return ClipNoise([""] * len(seeds), frames, seeds, device)
 
 
 class LinearEnds(Protocol):

@@ -87,8 +87,6 @@ class EmoTalk(DirectModel):
                 {"dim": dim, "num_heads": num_heads},
                 "dim must be a multiple of num_heads, and more than emotion, level and person have together",
             )
-        if not level < levels:
-            raise ArgumentError({"level": level}, f"there are {levels} levels, counted from 0")
         self.level = level
         self.emotion_encoder = Wav2Vec2Encoder(dim=None, source=emotion_source, config=emotion_config, edges=False)
         self.network = EmoTalkNetwork(

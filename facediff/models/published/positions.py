@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -25,8 +25,12 @@ def periodic_bias(
     """−2^(−8(h+1)/heads)·⌊(i − j)/period⌋ for head h, frame i and position j ≤ i; −∞ for j > i."""
     rows = torch.arange(start, start + frames, device=device)[:, None]
     distance = rows - torch.arange(start + frames, device=device)
+    return distance_bias(distance, heads, period).masked_fill(distance < 0, -torch.inf)
+
+
+def distance_bias(distance: Int[Tensor, "frames positions"], heads: int, period: int) -> Tensor:
+    """−2^(−8(h+1)/heads)·⌊distance/period⌋ for head h, (heads, frames, positions)."""
     # ALiBi's slopes (Press et al. 2022) on the distance in whole periods, as in FaceFormer, so that the frames of one
     # period count alike. Added to the scaled scores, as PyTorch does with a float mask.
-    slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=device).float() / heads)
-    bias = -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
-    return bias.masked_fill(distance < 0, -torch.inf)
+    slopes = 2.0 ** (-8.0 * torch.arange(1, heads + 1, device=distance.device).float() / heads)
+    return -slopes[:, None, None] * torch.div(distance, period, rounding_mode="floor")
