@@ -221,7 +221,6 @@ DRILLS = [
     Drill("data prepare", "mead3d mead3d out --flame flame.pkl --workers 1 --quiet", label="mead3d", pieces=True),
     Drill("data pack", f"corpus corpus.zarr --corpus {TINY} --workers 1 --quiet", pieces=True),
     Drill("data unpack", "packed.zarr back --workers 1 --quiet", once=True),
-    Drill("data regions", f"corpus --corpus {TINY} --size 64 -o a.png", f"corpus --corpus {TINY} --size 80 -o a.png"),
     Drill(
         "data import-person",
         "person.npy --audio person.wav --name Target --frame-rate 30 --corpus persons -o entry",

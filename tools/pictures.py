@@ -116,7 +116,6 @@ PICTURES: dict[str, tuple[str, ...]] = {
         "python {root}/tools/people_picture.py look.mp4 ada_corpus on_face.npz {picture}",
     ),
     "puppet_head.webp": ("python {root}/tools/puppet_sheet.py {picture}",),
-    "regions.png": ("facediff data regions {corpus} -o {picture}",),
     "study_narrow.png": (*STUDY, f"{RATING} --width 390 --height 844"),
     "study_wide.png": (*STUDY, f"{RATING} --width 1200 --height 760"),
     "talking_face.webp": (

@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import nn
 
-from facediff.data import SpeechMotionDataModule
+from facediff.callbacks.runs import require_facediff
 from facediff.data.spoken_sounds import IGNORED, SOUNDS, SpokenSounds
 from facediff.errors import FaceDiffError
 from facediff.models.base import AnimationModel
@@ -60,8 +60,7 @@ class SpokenSoundsTerm(Callback):
                 "SpokenSoundsTerm: its gradient is neither shared between processes nor scaled; train with one "
                 "process, in 32 bits or bf16-mixed"
             )
-        if not isinstance(data, SpeechMotionDataModule) or not isinstance(pl_module, AnimationModel):
-            raise FaceDiffError("SpokenSoundsTerm: needs a model and a data module of facediff")
+        require_facediff(self, pl_module, data)
         self._sounds = SpokenSounds(Path(self.recordings).expanduser(), data)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:  # noqa: ANN401, ARG002

@@ -86,7 +86,6 @@ COMMANDS = {
     "data check": Command("data:check", "recognise a folder, and report missing and wrong parts"),
     "data pack": Command("data:pack", "pack a corpus, for object storage and small disks", "packed"),
     "data unpack": Command("data:unpack", "write the corpus folder that a packed corpus holds", "packed"),
-    "data regions": Command("data:regions", "draw a corpus's lips and upper face on its mesh"),
     "data track": Command("track:track", "make a corpus of people from their videos", "prepare,render,onnx"),
     "data align": Command("data:align", "find the phones of people's recordings, and cut them", "align"),
     "data import-take": Command("data:import_take", "make a recording of Live Link Face a corpus entry", "prepare"),

@@ -19,7 +19,6 @@ from facediff.cli.options import (
     FileOrList,
     FrameRate,
     OutputFolder,
-    Size,
     WorkOptions,
 )
 from facediff.cli.parsing import Parameters, parameters_of, parse
@@ -359,40 +358,3 @@ def import_take(
         take, sound, name=name, output=output, offset=offset, most_offset=most_offset, clip_seconds=clip_seconds
     )
     tell(f"{output}: {report.name}", *report.lines())
-
-
-# ``facediff data regions``
-
-
-def regions(
-    root: Root,
-    *,
-    output: Annotated[Path, Option(also="-o", metavar="OUT", writes="file", suffixes=(".png",))] = Path("regions.png"),
-    corpus: Corpus = None,
-    lips: FileOrList = None,
-    upper_face: FileOrList = None,
-    size: Size = 640,
-) -> None:
-    """Draw a corpus's lips and upper face, the vertices over which LVE and FDD are computed, on its mesh.
-
-    Each region's name, vertex count and hash are written below. Needs the corpus's mesh and region files, no clips.
-
-    Args:
-        root: the corpus folder
-        output: the picture (.png)
-        corpus: the corpus, if it is not recognised: a name of `facediff components corpus`, or package.module.Class
-        lips: file in the folder, e.g. regions/lve.txt or FLAME_masks.pkl:lips (default: the corpus's own)
-        upper_face: file in the folder, e.g. regions/fdd.txt or FLAME_masks.pkl:forehead+eye_region (default: the
-            corpus's own)
-        size: height of each view in pixels
-    """
-    from facediff.data.packed.stores import is_packed
-    from facediff.evaluation.figures.regions import draw_regions
-
-    find_own_module(corpus)
-    if is_packed(root):
-        from facediff.data.packed.reader import PackedCorpus
-
-        root = PackedCorpus(root).folder
-    lines = draw_regions(root, output, corpus=corpus, lips=lips, upper_face=upper_face, size=size)
-    tell(*lines, f"written: {output}")

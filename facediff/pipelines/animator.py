@@ -28,7 +28,7 @@ from facediff.pipelines.motion import Samples
 from facediff.pipelines.video_styles import with_video_styles
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hints import check_number
-from facediff.utils.hub import EXPECTED_TO_ANIMATE, check_animating_source, is_audio2face, is_exported, model_or_bundled
+from facediff.utils.hub import check_animating_source, is_audio2face, is_exported, model_or_bundled
 from facediff.utils.licences import Commercial, commercial_use, in_words
 from facediff.utils.limits import SAMPLE_RATES
 from facediff.utils.paths import from_home
@@ -74,8 +74,6 @@ def load(
         >>> model.animate("speech.wav", identity="F1").save("speech.mp4")  # doctest: +SKIP
         [PosixPath('speech.mp4')]
     """
-    if source is not None and not isinstance(source, str | Path):
-        raise FaceDiffError(f"source: is of the type {type(source).__name__}; {EXPECTED_TO_ANIMATE}")
     path: str | Path = model_or_bundled(source)
     if is_exported(path):
         options = AnimationOptions(
@@ -551,11 +549,7 @@ def precision_of(dtype: DType) -> Literal["32", "bf16"]:
 
 
 def recordings_of(speech: Any) -> list[Any] | None:  # noqa: ANN401 - speech in any form
-    """Several recordings, from a list or a folder; None for one recording.
-
-    Raises:
-        FaceDiffError: if there is none.
-    """
+    """Several recordings, from a list or a folder; None for one recording."""
     speech = from_home(speech)
     if isinstance(speech, str | Path) and Path(speech).is_dir():
         from facediff.pipelines.folder import recordings
@@ -563,6 +557,4 @@ def recordings_of(speech: Any) -> list[Any] | None:  # noqa: ANN401 - speech in 
         return list(recordings([Path(speech)]))
     if not isinstance(speech, list) or (speech and all(isinstance(sample, numbers.Real) for sample in speech)):
         return None
-    if not speech:
-        raise FaceDiffError("speech: is an empty list; give at least one recording")
     return speech

@@ -120,8 +120,6 @@ class Audio2FacePipeline(AnimationPipeline):
     def generate(self, speech: Array, seeds: Sequence[int]) -> tuple[int, Iterator[Sequence[Array]]]:
         """Frames, and absolute vertices of the skin, a second after the other."""
         total = self.frames_of(len(speech))
-        if not total:
-            raise FaceDiffError("the speech holds no samples; give more of it")
         return total, self._seconds(speech, total)
 
     def _seconds(self, speech: Array, total: int) -> Iterator[Sequence[Array]]:
@@ -286,9 +284,6 @@ def emotions_of(text: str) -> dict[str, float]:
 
 def _style_text(options: AnimationOptions) -> str | None:
     """The style as an Audio2Face folder reads it: emotions with their weights."""
-    style = options.style
-    if style is None or isinstance(style, str | Path):
-        return None if style is None else str(style)
-    if isinstance(style, dict):
-        return ",".join(f"{name}:{weight}" for name, weight in style.items())
-    raise FaceDiffError(f"style: is of the type {type(style).__name__}; this model takes emotions with their weights")
+    if isinstance(options.style, dict):
+        return ",".join(f"{name}:{weight}" for name, weight in options.style.items())
+    return None if options.style is None else str(options.style)

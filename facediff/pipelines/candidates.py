@@ -233,12 +233,11 @@ def _animate(candidate: Candidate, clips: Sequence[SpokenClip], placement: Place
 def _read(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placement) -> CandidateMotion:
     from facediff.pipelines.motion import read
 
-    if candidate.motion is None or not candidate.motion.is_dir():
-        raise FaceDiffError(f"{candidate.motion}: no such folder; expected motion that is called as the clips are")
+    folder = candidate.motion or Path()
     motions: dict[str, SpokenMotion] = {}
     frame_rate = None
     for clip in clips:
-        files = [candidate.motion / f"{clip.name}{suffix}" for suffix in MOTION_SUFFIXES]
+        files = [folder / f"{clip.name}{suffix}" for suffix in MOTION_SUFFIXES]
         file = next((file for file in files if file.is_file()), None)
         if file is None:
             raise FaceDiffError(

@@ -173,8 +173,6 @@ def recordings(paths: Sequence[Path]) -> list[Path]:
             files = [file for file in files if not file.name.startswith(".")]
             if not files:
                 raise FaceDiffError(f"{path}: holds no recording; expected {', '.join(suffixes)}")
-        if not path.exists():
-            raise FaceDiffError(f"{path}: no such file or folder of recordings")
         for file in files:
             unique.setdefault(file.resolve(), file)
     return list(unique.values())
@@ -219,8 +217,6 @@ def run_folder(
     Outputs that an earlier run has made of the same recording, command (the options) and files (checkpoint, styles …)
     are kept, and a recording that failed is tried again only if something has changed or ``retry_failed`` is given.
     """
-    if workers is not None and workers < 1:  # 0 would mean the usual number, without a word
-        raise OptionError("workers", "expected 1 or more", workers)
     check_folder_writable(output)
     names = output_names(speeches, suffix)
     refuse_overwriting(speeches, [output / name for name in names])

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Unpack, cast
 from facediff.animation import Animation
 from facediff.animation.archives import AnimationFacts, complete, facts_of, read_animation
 from facediff.animation.options import AnimationControls, ExportKeywords, ExportOptions, SourceOptions, with_options
-from facediff.errors import FaceDiffError, OptionError, check_known, note, refuse_idle
+from facediff.errors import OptionError, check_known, note, refuse_idle
 from facediff.utils.hub import bundled_by_name, is_graphs
 from facediff.utils.paths import from_home
 
@@ -49,10 +49,6 @@ def compare(
     animations: Sequence[Animation], truth: Animation, output: str | Path | None, labels: Sequence[str] | None
 ) -> Page:
     """Animations next to the truth: :meth:`Animation.compare` and :meth:`Samples.compare`."""
-    if not isinstance(truth, Animation):
-        raise FaceDiffError(
-            f"truth: is of the type {type(truth).__name__}; expected an animation, as facediff.read gives it"
-        )
     names = [animation.name for animation in animations]
     if labels is None and truth.name in names:  # as of one recording
         labels = ["truth", *names]
@@ -228,8 +224,6 @@ def view(
     """
     predictions = [animations] if isinstance(animations, Animation) else list(animations)
     panels = [*([] if truth is None else [truth]), *predictions]
-    if not panels:
-        raise FaceDiffError("animations: there is none to show; give at least one")
     if labels is not None and len(labels) != len(panels):
         raise OptionError.naming(
             f"{{labels}}: {len(labels)} names for {len(panels)} panels; give one for each, the truth's first"

@@ -73,8 +73,6 @@ def check_stream(options: AnimationOptions, output: Path, export: ExportOptions)
     options_changed = {**options.changed(), **export.changed()}
     needs_animation = "needs the whole animation, as `facediff export` takes it from a streamed .npy"
     refuse_idle(needs_animation, **{name: name in options_changed for name in WHOLE})
-    if sys.stdin is None:
-        raise OptionError.naming("{stream}: standard input is closed; send samples to it")
     if str(output) != "-":
         check_writable(output)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from facediff.animation.styles import split_styles
-from facediff.errors import OptionError, note
+from facediff.errors import note
 from facediff.speech.audio import SAMPLE_RATE, VIDEOS
 
 if TYPE_CHECKING:
@@ -44,8 +44,6 @@ def video_style(video: Path, model: Any) -> Path:  # noqa: ANN401 - an Animator,
     from facediff.utils.checksums import sha256
     from facediff.utils.files import cache_dir, scratch_folder
 
-    if not video.is_file():
-        raise OptionError.naming(f"{{style}} {video}: no such file")
     target = cache_dir() / "styles" / ArrayStore.key(sha256(video), model.corpus, model.n_vertices)
     target = target / f"{video.stem}.npz"
     if target.is_file():

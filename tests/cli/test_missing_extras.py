@@ -44,7 +44,6 @@ EXTRAS = {
     "data check p": "train",
     "data pack p packed": "packed",
     "data unpack p unpacked": "packed",
-    "data regions p": "train",
     "data import-person a.wav --audio a.wav --name x --corpus p --output o --frame-rate 25": "prepare",
     "components": "train",
     "check-install": "",

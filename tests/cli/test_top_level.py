@@ -51,7 +51,6 @@ MISTAKES = [
     "evaluate missing truth",
     "figure lips missing truth -o a.png",
     "data check missing",
-    "data regions missing",
     "data import-person missing --audio a --name b --corpus c -o d --frame-rate 25",
     "study make missing other -o a",
     "study make a=. --truth missing -o a",

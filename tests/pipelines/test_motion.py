@@ -108,12 +108,8 @@ def test_pages_are_those_of_the_command(anim: facediff.Animation, tmp_path: Path
         facediff.view([other], truth=anim)
     with pytest.raises(facediff.FaceDiffError, match="labels"):
         facediff.view(anim, labels=["a", "b"])
-    with pytest.raises(facediff.FaceDiffError, match="animations"):
-        facediff.view([])
     with pytest.raises(facediff.FaceDiffError, match=r"x\.htm2"):
         page.save(tmp_path / "x.htm2")
-    with pytest.raises(facediff.FaceDiffError, match="truth"):
-        anim.compare(np.zeros((3, 3)))  # type: ignore[arg-type]
     twins = anim.compare(replace(anim, vertices=anim.vertices + 1))
     assert [each.name for each in twins.animations] == ["truth", "clicks"]
 

@@ -1,11 +1,9 @@
-"""Checking and drawing packed corpora."""
+"""Checking packed corpora."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-
-import pytest
 
 from facediff.data.check import check
 from tests.data.packed.damage import TINY
@@ -17,11 +15,3 @@ def test_the_check_understands_packed_corpora(corpus: Path, packed: Path) -> Non
     assert (other.splits, other.subjects, other.regions) == (plain.splits, plain.subjects, plain.regions)
     assert {finding.kind for finding in other.findings} - {finding.kind for finding in plain.findings} == {"packed"}
     assert str(packed) in json.dumps(other.state())
-
-
-def test_the_regions_of_a_packed_corpus_are_drawn(packed: Path, tmp_path: Path) -> None:
-    pytest.importorskip("cv2")
-    from facediff.cli.data import regions
-
-    regions(packed, output=tmp_path / "regions.png", corpus=TINY, size=64)
-    assert (tmp_path / "regions.png").stat().st_size
