@@ -83,7 +83,7 @@ def test_defaults_of_whole_tables(page: str, head: str, owner: Owner) -> None:
         ("FaceFormer", "FaceFormer", 2),
         ("CodeTalker", "CodeTalker", 3),
         ("FaceDiffuser", "FaceDiffuser", 3),
-        ("DiffSpeaker", "DiffSpeaker", 5),
+        ("DiffSpeaker", "DiffSpeaker", 4),
         ("SelfTalk", "SelfTalk", 6),
         ("TalkingStyle", "TalkingStyle", 2),
         ("VOCA", "Voca", 3),
