@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import re
+import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -172,16 +172,9 @@ def text_width(text: str, size: float, font: str = FONT) -> float:
 
 
 def wrapped(text: str, width: float, size: float, font: str = FONT) -> list[str]:
-    """Text in lines of at most a width in mm: broken behind blanks, "-" and "_" where that is enough, else anywhere."""
-    lines = [""]
-    for word in re.findall(r"[^ \-_]*[ \-_]|[^ \-_]+", text):
-        if lines[-1] and text_width(lines[-1] + word.rstrip(), size, font) > width:
-            lines.append("")
-        lines[-1] += word
-        while len(lines[-1]) > 1 and text_width(lines[-1].rstrip(), size, font) > width:
-            fits = max(1, sum(text_width(lines[-1][: n + 1], size, font) <= width for n in range(len(lines[-1]))))
-            lines[-1:] = [lines[-1][:fits], lines[-1][fits:]]
-    return [line.rstrip() for line in lines if line.strip()] or [""]
+    """Text in lines of at most about a width in mm, by the mean width of its letters."""
+    letters = int(len(text) * width / max(text_width(text, size, font), 1e-6))
+    return textwrap.wrap(text, max(letters, 1)) or [""]
 
 
 def line_height(size: float) -> float:
