@@ -311,9 +311,10 @@ class SourceReader:
             overrides |= {"template": mesh.vertices.astype(np.float32), "faces": mesh.faces}
             overrides |= {} if mesh.colours is None else {"colours": mesh.colours}
         if options.speech is not None:
-            from facediff.speech.audio import read_sound_to_play
+            from facediff.speech.audio import read_recording
 
-            overrides["speech"], overrides["sample_rate"] = read_sound_to_play(Path(options.speech))
+            recording = read_recording(Path(options.speech))
+            overrides |= {"speech": recording.sound, "sample_rate": recording.rate}
         overrides |= {} if options.frame_rate is None else {"frame_rate": options.frame_rate}
         overrides |= {} if options.unit is None else {"unit": options.unit}
         return cast("AnimationFacts", overrides), defaults

@@ -95,24 +95,12 @@ FULL_SCALE = {"uint8": (128.0, 128), "int16": (32768.0, 0), "int32": (2.0**31, 0
 
 
 def read_speech(path: Path, *, max_seconds: float | None = None) -> npt.NDArray[np.float32]:
-    """Read a recording, or the sound of a video, as (S,) float32 mono at 16 kHz.
+    """Read a recording, or the sound of a video, as (S,) float32 mono at 16 kHz, by its content, whatever its name.
 
-    A file is read by its content, whatever its name. Channels are averaged, as :func:`mono` does; another rate is
-    resampled by soxr (high quality). The file's header is checked before anything is decoded, and decoding ends where
-    the speech becomes too long.
-
-    Args:
-        path: the file.
-        max_seconds: longest speech allowed; None for any.
+    Channels are averaged, as :func:`mono` does; another rate is resampled by soxr (high quality). Decoding ends where
+    the speech becomes longer than ``max_seconds``.
     """
     return to_speech(*_read(path, str(path), max_seconds), str(path))
-
-
-def read_sound_to_play(path: Path) -> tuple[npt.NDArray[np.float32], int]:
-    """Read a recording as :func:`read_speech` does, at its own rate from 16 to 48 kHz; the samples and the rate."""
-    samples, rate = _read(path, str(path), None)
-    playable = _rate_to_play(rate)
-    return _resampled(_checked(samples, str(path)), rate, playable), playable
 
 
 def _read(source: Path | IO[bytes], name: str, max_seconds: float | None) -> tuple[npt.NDArray[np.float32], int]:
@@ -186,11 +174,6 @@ def to_speech(samples: npt.NDArray[np.floating], rate: float, name: str) -> npt.
     return _resampled(_checked(samples, name), rate, SAMPLE_RATE)
 
 
-def _rate_to_play(rate: float) -> int:
-    """The sample rate at which sound is kept for playing: its own, from 16 to 48 kHz."""
-    return int(min(max(rate, SAMPLE_RATE), PLAYED))
-
-
 def _checked(samples: npt.NDArray[np.floating], name: str) -> npt.NDArray[np.floating]:
     """Mono, where all samples are in range; whole numbers that were made floating point are scaled to 1."""
     peak = float(np.maximum(samples.max(initial=0.0), -samples.min(initial=0.0)))  # without a copy of all samples
@@ -212,16 +195,13 @@ def mono(
     length: int | None = None,
     say: Callable[[str], None] = note,
 ) -> Samples:
-    """The mean of the channels that have any sound; the loudest channel alone where they cancel each other.
+    """The mean (S,) of the channels that have any sound; the loudest channel alone where they cancel each other.
 
     Args:
         blocks: gives the samples (n, channels) of each block in order, and again from the beginning when called again.
-        name: what the note on channels that cancel calls the recording.
+        name: of the recording in the note on channels that cancel.
         length: number of all samples, where it is known: a long recording then fits once into memory, not twice.
         say: takes that note.
-
-    Returns:
-        Samples (S,).
     """
     energy, spent, lost = np.zeros(1), 0.0, 0.0
 
@@ -327,11 +307,7 @@ def _decoded(file: Any, name: str, limit: float | None) -> tuple[Samples, int]: 
 def _decode_container(stream: IO[bytes], name: str, limit: float | None, refusal: FaceDiffError) -> tuple[Samples, int]:
     """The sound track of a container in which there is a voice, (S,) mono, from the time of its first picture on.
 
-    Args:
-        stream: the file.
-        name: what messages call it.
-        limit: longest speech allowed.
-        refusal: the error where FFmpeg knows no such content either.
+    ``refusal`` is the error where FFmpeg knows no such content either.
     """
     try:
         with needs_extra("av", "prepare", f"extracting the sound of {Path(name).suffix} files"):
@@ -466,7 +442,6 @@ class SpeechRecording:
     """A recording to animate.
 
     Attributes:
-        name: its animation's name.
         speech: (S,) float32 mono at 16 kHz, which models hear.
         sound: (N,) float32 mono, which is played and written with the animation.
         rate: sample rate of the sound in Hz.
@@ -487,22 +462,17 @@ class SpeechRecording:
     @classmethod
     def of(cls, samples: npt.NDArray[np.floating], rate: float, name: str, source: str) -> SpeechRecording:
         """Of samples (S,), full scale 1, at any rate; ``source`` is what errors call them."""
-        mono, playable = _checked(samples, source), _rate_to_play(rate)
+        mono, playable = _checked(samples, source), int(min(max(rate, SAMPLE_RATE), PLAYED))
         speech = _resampled(mono, rate, SAMPLE_RATE)
-        check_speech(speech, source)
+        if len(speech) < MIN_SECONDS * SAMPLE_RATE:  # silence animates a face at rest
+            seconds = len(speech) / SAMPLE_RATE
+            raise FaceDiffError(f"{source}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
         return cls(name, speech, speech if playable == SAMPLE_RATE else _resampled(mono, rate, playable), playable)
 
 
 def read_recording(path: Path, max_seconds: float | None = None) -> SpeechRecording:
     """A wav, flac, ogg, mp3 or video file, to animate."""
     return replace(SpeechRecording.of(*_read(path, str(path), max_seconds), path.stem, str(path)), path=str(path))
-
-
-def check_speech(speech: npt.NDArray[np.float32], name: str) -> None:
-    """Refuse speech (S,) that is too short to animate anything; silence animates a face at rest."""
-    seconds = len(speech) / SAMPLE_RATE
-    if seconds < MIN_SECONDS:
-        raise FaceDiffError(f"{name}: lasts {seconds:.2f} s; expected speech of at least {MIN_SECONDS} s")
 
 
 def speech_of(speech: Speech, rate: float | None = None, max_seconds: float | None = None) -> SpeechRecording:

@@ -86,11 +86,7 @@ _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_short), ctype
 
 
 def speak(text: str, voice: EspeakVoice) -> Utterance:
-    """Speak a sentence; the same text and voice give the same samples every time.
-
-    Returns:
-        The waveform at 16 kHz and the phonemes with their times.
-    """
+    """Speak a sentence; the same text and voice give the same samples and times of phonemes."""
     library, _ = _paths()
     if _is_loaded(library):
         return _finish(*_speak_elsewhere(text, voice))

@@ -31,12 +31,10 @@ MOST_CHARACTERS = 2000
 
 @dataclass(frozen=True)
 class TimedPhoneme:
-    """A phoneme in time.
+    """A phoneme from a start to an end in seconds.
 
     Attributes:
-        start: where it begins, in seconds.
-        end: where it ends.
-        ipa: the phoneme, with stress and length marks; empty for a pause.
+        ipa: with stress and length marks; empty for a pause.
         viseme: names of its visemes, joined by "+"; may be empty.
         word: the word it belongs to; empty if that is not known.
     """
@@ -59,12 +57,7 @@ class TimedPhoneme:
 
 
 def phonemes_text(phonemes: Iterable[TimedPhoneme]) -> str:
-    """Phonemes as JSON: rows of start and end in seconds, the phoneme, and its word.
-
-    Example:
-        >>> phonemes_text([TimedPhoneme(0.1, 0.2, "m", word="mama")])
-        '[[0.1, 0.2, "m", "mama"]]'
-    """
+    """Phonemes as JSON: rows of start and end in seconds, the phoneme, and its word."""
     rows = [[round(sound.start, 3), round(sound.end, 3), sound.ipa, sound.word] for sound in phonemes]
     return json.dumps(rows, ensure_ascii=False)
 
@@ -108,10 +101,6 @@ def closing(labels: Sequence[str]) -> list[str | None]:
     Labels may be in the IPA with diacritics and ties, in X-SAMPA, or in the ARPAbet as Kaldi, the Montreal Forced
     Aligner, TIMIT and Buckeye write it: with stress, with places in the word, closures as labels of their own. In
     X-SAMPA capital letters are other sounds, in the ARPAbet they are the same.
-
-    Example:
-        >>> closing(["P_B", "AA1_I", "M_E"]), closing(["p_h", "M", "k͡p", "m="])
-        (['p', None, 'm'], ['p', None, 'p', 'm'])
     """
     plain = [_PLACE.sub("", label.strip().strip(_MARKS)) for label in labels]
     sounds = [label for label in plain if label.lower() not in SILENCES]
@@ -142,16 +131,7 @@ def _closing(label: str) -> str | None:
 
 
 def closures(phonemes: Sequence[TimedPhoneme], frame_rate: float) -> list[tuple[int, int]]:
-    """The frames in which the lips close for p, b and m, as `facediff.metrics.BilabialClosureRate` takes them.
-
-    Returns:
-        First frame and frame after the last of each closure, in order; at least one frame each. Closures that touch
-        are one.
-
-    Example:
-        >>> closures([TimedPhoneme(0.0, 0.1, "m"), TimedPhoneme(0.3, 0.31, "b")], 25)
-        [(0, 2), (8, 9)]
-    """
+    """The first frame and the frame after the last of each closure for p, b and m; closures that touch are one."""
     frames: list[tuple[int, int]] = []
     for opens, closes in closed_times(phonemes):
         start = round(opens * frame_rate)
@@ -176,8 +156,7 @@ def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPho
 def read_alignment(path: Path) -> list[TimedPhoneme]:
     """Phonemes in time from a TextGrid (``.TextGrid``), or a table as :func:`read_phonemes` reads it.
 
-    A note says how many labels close the lips, as :func:`closing` understands them; those are p, b or m, and pauses are
-    empty.
+    A note says how many labels close the lips; those are p, b or m here, and pauses are empty.
     """
     if path.suffix.lower() == ".textgrid":
         phonemes = [TimedPhoneme(start, end, label) for start, end, label in phones_in(path)]

@@ -55,13 +55,6 @@ def pitch_of(piece: Wave) -> float | None:
     The method is YIN (de Cheveigné and Kawahara, "YIN, a fundamental frequency estimator for speech and music", Journal
     of the Acoustical Society of America 111(4), 2002), with its steps 2 to 5: difference, its normalisation by the mean
     of shorter lags, an absolute threshold and a parabola.
-
-    Example:
-        >>> tone = np.sin(2 * np.pi * 200 * np.arange(SPAN) / SAMPLE_RATE)
-        >>> round(pitch_of(tone))
-        200
-        >>> pitch_of(0 * tone) is None
-        True
     """
     wave = np.asarray(piece[:SPAN], np.float64)
     wave = wave - wave.mean()
@@ -94,13 +87,7 @@ def pitch_of(piece: Wave) -> float | None:
 
 @dataclass(frozen=True)
 class ProsodicEvent:
-    """Something in the melody of speech.
-
-    Attributes:
-        kind: an accent of the pitch, a stressed syllable, or the end of a phrase.
-        time: when, in seconds.
-        strength: how prominent, 0 to 1.
-    """
+    """An accent of the pitch, a stressed syllable or the end of a phrase; time in seconds, strength from 0 to 1."""
 
     kind: Literal["accent", "stress", "phrase_end"]
     time: float
@@ -108,16 +95,10 @@ class ProsodicEvent:
 
 
 class ProsodyTracker:
-    """Follows the prosody of one recording, in pieces.
+    """Follows the prosody of one recording, in pieces; a gate says when there is speech.
 
     An accent is where pitch, and to a lesser part loudness, rises above the speaker's usual value so far; a
     stressed syllable is a peak of loudness; a phrase ends where half a second of speech or more is followed by a pause.
-
-    Args:
-        gate: says when there is speech.
-
-    Attributes:
-        events: what has been found so far, in the order in which it is certain.
     """
 
     look_ahead = PAUSE + 2

@@ -24,21 +24,10 @@ PASSED = 0.92
 
 
 class Resampler:
-    """Converts pieces of a stream, by a filter of windowed sines for each phase between the two rates.
-
-    Args:
-        source: samples a second that come.
-        target: samples a second that are wanted.
+    """Converts pieces of a stream, by a filter of windowed sines for each phase between the two rates in Hz.
 
     Attributes:
         delay: seconds of the stream that are held back.
-
-    Example:
-        >>> resampler = Resampler(48_000, 16_000)
-        >>> len(resampler(np.zeros(4800, np.float32))), len(resampler(np.zeros(4800, np.float32)))
-        (1568, 1600)
-        >>> resampler.delay
-        0.002
     """
 
     def __init__(self, source: int, target: int) -> None:

@@ -122,7 +122,8 @@ def write_text_grid(path: Path, tiers: Mapping[str, Sequence[Interval]], end: fl
         tiers: intervals by name of the tier, in order of time.
         end: in seconds.
     """
-    lines = ['File type = "ooTextFile"', 'Object class = "TextGrid"', "", "xmin = 0", f"xmax = {end:.4f}"]
+    span = ["xmin = 0", f"xmax = {end:.4f}"]
+    lines = ['File type = "ooTextFile"', 'Object class = "TextGrid"', "", *span]
     lines += ["tiers? <exists>", f"size = {len(tiers)}", "item []:"]
     for number, (name, intervals) in enumerate(tiers.items(), 1):
         filled: list[Interval] = []
@@ -130,14 +131,10 @@ def write_text_grid(path: Path, tiers: Mapping[str, Sequence[Interval]], end: fl
             before = filled[-1][1] if filled else 0.0
             filled += [(before, start, "")] if start - before > 1e-4 else []
             filled += [(max(start, before), stop, text)] if stop - max(start, before) > 1e-4 else []
-        lines += [f"    item [{number}]:", '        class = "IntervalTier"', f'        name = "{name}"']
-        lines += ["        xmin = 0", f"        xmax = {end:.4f}", f"        intervals: size = {len(filled)}"]
+        lines += [f"item [{number}]:", 'class = "IntervalTier"', f'name = "{name}"', *span]
+        lines += [f"intervals: size = {len(filled)}"]
         for index, (start, stop, text) in enumerate(filled, 1):
-            lines += [
-                f"        intervals [{index}]:",
-                f"            xmin = {start:.4f}",
-                f"            xmax = {stop:.4f}",
-            ]
-            lines += ['            text = "{}"'.format(text.replace('"', '""'))]
+            quoted = text.replace('"', '""')
+            lines += [f"intervals [{index}]:", f"xmin = {start:.4f}", f"xmax = {stop:.4f}", f'text = "{quoted}"']
     with atomic(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -140,14 +140,7 @@ class Listener(ABC):
 
 
 def read_gate(text: str) -> VoiceGate | None:
-    """A gate from ``NAME:option=value,option=value``; None for ``off``.
-
-    Example:
-        >>> read_gate("energy:release=0.2").release
-        0.2
-        >>> read_gate("off") is None
-        True
-    """
+    """A gate from ``NAME:option=value,option=value``; None for ``off``."""
     if text.strip() == OFF:
         return None
     try:
@@ -429,16 +422,6 @@ class Openness:
 
     It is 1 from ``lead`` before speech until ``hold`` after it, and rises and falls smoothly. A frame depends on speech
     up to :attr:`look_ahead` after it, and not on how the speech was cut into pieces.
-
-    Args:
-        gate: finds speech.
-        frame_rate: of the motion.
-
-    Example:
-        >>> import numpy as np
-        >>> found = Openness(read_gate("energy"), 25.0)
-        >>> float(np.concatenate([found.feed(np.zeros(16000)), found.finish(25)]).max())
-        0.0
     """
 
     def __init__(self, gate: VoiceGate, frame_rate: float) -> None:
@@ -516,13 +499,7 @@ PART = SAMPLE_RATE // 20
 
 
 def speech_problems(speech: Wave) -> list[str]:
-    """Faults of a recording (S,) at 16 kHz, each in a few words; empty if it has none.
-
-    Example:
-        >>> import numpy as np
-        >>> speech_problems(np.zeros(16000))
-        ['is silent']
-    """
+    """Faults of a recording (S,) at 16 kHz, each in a few words; empty if it has none."""
     peak = float(max(speech.max(initial=0), -speech.min(initial=0)))
     if peak < 1e-4:
         return ["is silent"]
@@ -562,13 +539,8 @@ def _clipped(speech: Wave, level: float) -> float:
 class MouthAtRest:
     """Brings the mouth of one face to rest in pauses; the upper face keeps its motion.
 
-    Where the gate is open, the motion is bit for bit the model's.
-
-    Args:
-        gate: finds speech.
-        template: neutral face (V, 3); at rest, the mouth is its mouth.
-        weights: how far each vertex (V,) goes to rest.
-        frame_rate: of the motion.
+    Where the gate is open, the motion is bit for bit the model's. At rest, the mouth is the template's (V, 3), as far
+    as each vertex's weight (V,) says.
     """
 
     def __init__(

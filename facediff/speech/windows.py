@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,6 @@ Speech = npt.NDArray[np.float32]
 
 M = TypeVar("M")
 """Motion of one or several samples: an array or a tensor (seeds, frames, …)."""
-M_co = TypeVar("M_co", covariant=True)
 
 QUIETEST = 0.003
 """Standard deviation below which speech is not amplified further: noise of a microphone, not speech."""
@@ -46,17 +45,12 @@ class FrameClock:
     frame more or less moves all others.
 
     Attributes:
-        frame_rate: motion frames a second.
         rule: ``rounded``: as many as fit the speech, which is then cut or filled up to whole frames. With all others
             the model takes every sample: ``steps``: by the network's steps; ``pairs``: two steps a frame; ``seconds``:
             a frame less than the speech lasts; ``seconds_or_pairs``: the smaller of the two; ``rows``: one of every so
             many rows of a finer clock, from the first on; ``up``: a frame for every part of one.
         convolutions: kernel and stride of each convolution of the speech network.
         rows: rows a frame of the finer clock.
-
-    Example:
-        >>> FrameClock(25.0).frames(16_000), FrameClock(25.0, "pairs").frames(16_000)
-        (25, 24)
     """
 
     frame_rate: float
@@ -68,23 +62,17 @@ class FrameClock:
         """Frames that the model gives; 0 or less if the speech is too short for one."""
         # In these very orders and in floating point, as the projects compute them: 205 steps at 30 frames a second give
         # 122 frames, not 123, and half a row is rounded to an even number.
-        pairs = convolved(samples, self.convolutions) // 2
+        steps = convolved(samples, self.convolutions)
         seconds = int(samples / SAMPLE_RATE * self.frame_rate) - 1
-        match self.rule:
-            case "rounded":
-                return round(samples * self.frame_rate / SAMPLE_RATE)
-            case "steps":
-                return int((convolved(samples, self.convolutions) / STEP_RATE) * self.frame_rate)
-            case "pairs":
-                return pairs
-            case "seconds":
-                return seconds
-            case "seconds_or_pairs":
-                return min(seconds, pairs)
-            case "rows":
-                return -(-self.row_count(samples) // self.rows)
-            case "up":
-                return math.ceil(samples / SAMPLE_RATE * self.frame_rate)
+        return {
+            "rounded": round(samples * self.frame_rate / SAMPLE_RATE),
+            "steps": int((steps / STEP_RATE) * self.frame_rate),
+            "pairs": steps // 2,
+            "seconds": seconds,
+            "seconds_or_pairs": min(seconds, steps // 2),
+            "rows": -(-self.row_count(samples) // self.rows),
+            "up": math.ceil(samples / SAMPLE_RATE * self.frame_rate),
+        }[self.rule]
 
     def row_count(self, samples: int) -> int:
         """Rows of the finer clock."""
@@ -92,11 +80,7 @@ class FrameClock:
 
 
 def convolved(samples: int, layers: Iterable[tuple[int, int]]) -> int:
-    """Steps that convolutions without padding, each of a kernel and a stride, make of so many samples; at least 0.
-
-    >>> convolved(16_000, CONVOLUTIONS)
-    49
-    """
+    """Steps that convolutions without padding, each of a kernel and a stride, make of so many samples; at least 0."""
     for kernel, stride in layers:
         samples = max(0, (samples - kernel) // stride + 1)
     return samples
@@ -106,22 +90,15 @@ def convolved(samples: int, layers: Iterable[tuple[int, int]]) -> int:
 class WindowPlan:
     """How long speech is cut into windows; lengths in seconds.
 
-    Models of this field learn from sentences of three to five seconds, so they are at their best with windows of that
-    length. One that was trained on longer clips may do better with longer windows, and must cope with speech up to
-    ``above``.
-
-    With a ``past``, a window sees motion before it that is given out already and does not change any more, so that
-    windows may be as short as a frame or two: :data:`LOW_LATENCY`.
+    Models of this field learn from sentences of three to five seconds, and are at their best with windows of that
+    length. With a ``past``, windows may be as short as a frame or two: :data:`LOW_LATENCY`.
 
     Attributes:
         seconds: length of a window's motion.
-        overlap: how much of it the next one shares; at most half of it. With a ``past``: 0, or less than
-            all of it.
-        before: speech before the window that the model receives too.
-        after: speech after the window that the model receives too.
-        above: speech that lasts longer than this is animated by windows; shorter speech in one pass. Infinite: always
-            in one pass.
-        past: motion before the window that it sees and continues.
+        overlap: how much of it the next one shares; at most half of it, with a ``past`` less than all of it.
+        before, after: speech around the window that the model receives too.
+        above: speech that lasts longer is animated by windows, other speech in one pass.
+        past: motion before the window, given out already, that it sees and continues.
         ahead: motion after the window that is generated with it and not given out. Its noise is known before its
             speech; where that is not heard yet, the speech is taken to stay as it was last.
 
@@ -181,10 +158,7 @@ class WindowPlan:
 
     @property
     def look_ahead(self) -> float:
-        """Seconds of speech, at most, that must be heard after an instant before its frame is certain.
-
-        The first frame of a window waits for the whole window and for the speech after it.
-        """
+        """Seconds of speech after an instant, at most, before its frame is certain: a whole window's, and after it."""
         return self.seconds + self.after
 
 
@@ -200,16 +174,7 @@ LOW_LATENCY_STEPS = 2
 
 @dataclass(frozen=True)
 class FramePlan:
-    """A :class:`WindowPlan` in frames.
-
-    Attributes:
-        frames: that a window animates.
-        overlap: shared by neighbours.
-        before: of speech before a window.
-        after: of speech after it.
-        past: of the motion before a window, which it sees.
-        ahead: of the motion after a window, which is generated with it.
-    """
+    """A :class:`WindowPlan` in frames."""
 
     frames: int
     overlap: int
@@ -235,13 +200,7 @@ class FramePlan:
 
 @dataclass(frozen=True)
 class MotionWindow:
-    """One window of long speech.
-
-    Attributes:
-        plan: the lengths of full windows.
-        index: how many windows come before it.
-        frames: frames of this window with its past, fewer than usual for the last one.
-    """
+    """One window of long speech: its plan, its number, and its frames with its past; the last one has fewer."""
 
     plan: FramePlan
     index: int
@@ -286,10 +245,9 @@ class MotionWindow:
 
     @property
     def origins(self) -> list[tuple[int, slice]]:
-        """The windows in which its frames, and those ahead of it, first appear.
+        """The windows in which its frames, and those ahead of it, are new: index, and which of the new ones they are.
 
-        For each its index, and which of the frames that are new in it lie in this window. All frames of the first
-        window are new in it, and the last ones of every other.
+        All frames of the first window are new in it, and the last ones of every other.
         """
         origins, overlap, hop, last = [], self.plan.overlap, self.plan.hop, self.end + self.plan.ahead
         for index in range(max(0, (self.start - overlap) // hop), max(self.index, (last - 1 - overlap) // hop) + 1):
@@ -300,54 +258,33 @@ class MotionWindow:
         return origins
 
 
-class MotionStream(Protocol[M_co]):
-    """Takes speech in pieces and gives motion; counts the frames that it has given."""
-
-    frames: int
-
-    def feed(self, samples: Any, /) -> M_co:  # noqa: ANN401 - an array or a tensor
-        """The motion that has become certain after more speech."""
-
-    def finish(self, frames: int | None = None, /) -> M_co:
-        """The motion that is left."""
-
-
 def in_parts(
-    stream: MotionStream[M_co],
+    stream: Any,  # noqa: ANN401 - feeds, finishes and counts frames, as SpeechWindows do
     speech: Any,  # noqa: ANN401 - an array or a tensor
     *,
     frames: int | None = None,
     progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
-) -> Iterator[M_co]:
-    """All motion of a stream for a recording, part by part; arguments as of :meth:`SpeechWindows.parts`."""
+) -> Iterator[Any]:
+    """All motion of a stream for a recording, part by part; ``frames`` in all if given."""
     # Fed by the second, as from a microphone, so that memory does not grow with the recording.
-    last = max(0, math.ceil(len(speech) / SAMPLE_RATE) - 1)
-    seconds = range(last + 1)
-    for second in progress(seconds) if progress is not None else seconds:
+    seconds = range(max(1, math.ceil(len(speech) / SAMPLE_RATE)))
+    for second in seconds if progress is None else progress(seconds):
         before = stream.frames
         part = stream.feed(speech[second * SAMPLE_RATE : (second + 1) * SAMPLE_RATE])
         if stream.frames > before:
             yield part
-        if second == last:
-            before = stream.frames
-            part = stream.finish(frames)
-            if stream.frames > before:
-                yield part
+    before = stream.frames
+    part = stream.finish(frames)
+    if stream.frames > before:
+        yield part
 
 
 class SpeechWindows(ABC, Generic[M]):
     """Animates speech that arrives in pieces, window by window; memory does not grow with its length.
 
-    A frame is certain once its window, but for the frames that this window shares with the next, and the speech after
-    that window have been heard: :attr:`WindowPlan.look_ahead` seconds later at most. The result depends on the speech
-    and the plan only, not on how the speech was cut into pieces, and not on speech after the look-ahead: it is the
-    same for a file and for a microphone.
-
-    Each window's speech is standardised by mean and deviation of all speech heard up to the end of that window.
-
-    Args:
-        plan: the windows.
-        frame_rate: of the motion.
+    A frame is certain :attr:`WindowPlan.look_ahead` seconds later at most. The result depends on the speech up to then
+    and the plan only, not on how the speech was cut into pieces: it is the same for a file and for a microphone. Each
+    window's speech is standardised by mean and deviation of all speech heard up to the end of that window.
 
     Attributes:
         frames: how many have been given out so far.
@@ -401,15 +338,9 @@ class SpeechWindows(ABC, Generic[M]):
             parts.append(self._generate(replace(self._window, frames=self._window.fixed + left), total))
         return self._counted(parts)
 
-    def parts(
-        self,
-        speech: Speech,
-        *,
-        frames: int | None = None,
-        progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
-    ) -> Iterator[M]:
-        """All motion for a recording, part by part."""
-        return in_parts(self, speech, frames=frames, progress=progress)
+    def parts(self, speech: Speech, **options: Any) -> Iterator[M]:  # noqa: ANN401
+        """All motion for a recording, part by part; options as of :func:`in_parts`."""
+        return in_parts(self, speech, **options)
 
     @property
     def _heard(self) -> int:

@@ -19,7 +19,7 @@ from facediff.errors import FaceDiffError
 from facediff.evaluation.figures.gather import gather
 from facediff.evaluation.file_pairs import DEFAULT_PATTERNS, OWN, NamePattern
 from facediff.mesh import read_mesh
-from facediff.speech.audio import CONTAINERS, SUFFIXES, read_sound_to_play
+from facediff.speech.audio import CONTAINERS, SUFFIXES, read_recording
 from facediff.study.design import STILL, TRUTH
 from facediff.utils.paths import find_file, name_of_file
 
@@ -310,6 +310,7 @@ def read_sound(path: Path, seconds: float) -> tuple[npt.NDArray[np.float32], int
         animation = read_animation(path)
         speech, rate = np.zeros(0) if animation.speech is None else animation.speech, animation.sample_rate
     else:
-        speech, rate = read_sound_to_play(path)
+        recording = read_recording(path)
+        speech, rate = recording.sound, recording.rate
     length = round(seconds * rate)
     return np.pad(speech[:length], (0, max(0, length - len(speech)))).astype(np.float32), rate

@@ -63,7 +63,7 @@ class Articulation:
     """The targets of a sound in the face.
 
     Attributes:
-        targets: weights of the rig's shapes aimed at; shapes with a left and a right side are named without one.
+        targets: weights of the rig's shapes; those with two sides are named without one.
         strength: how much it dominates its neighbours (Cohen and Massaro's magnitude of dominance); weak sounds take
             the shape of the sounds next to them.
         reach: how far its influence spreads in time, as a factor.

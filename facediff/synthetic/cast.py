@@ -19,17 +19,9 @@ from facediff.synthetic.performance import SpeakingHabits
 
 @dataclass(frozen=True)
 class CastMember:
-    """One of the speakers.
+    """One of the speakers: a voice (:mod:`facediff.synthetic.voices`), its delivery, a face and its habits.
 
-    Attributes:
-        name: identity, such as ``F1``.
-        voice: name of a voice (:mod:`facediff.synthetic.voices`).
-        rate: words a second, as a factor of the voice's own.
-        pitch: semitones above the voice's own pitch.
-        pitch_range: liveliness of the melody as a factor.
-        face: how the head differs from the average.
-        complexion: colours and hair.
-        habits: how the face moves.
+    Rate and range of the pitch are factors of the voice's own; the pitch is semitones above it.
     """
 
     name: str
@@ -153,8 +145,7 @@ def member_of(name: str, people: Sequence[str] = ()) -> CastMember:
 def _drawn(number: int, people: tuple[str, ...]) -> CastMember:
     """A speaker with random face, complexion, voice and habits; the same number gives the same speaker.
 
-    Faces are normally distributed about the average within the bounds of :class:`Face`. Habits lie in the range of the
-    seen six, a fifth wider; those who are only tested have no part in it.
+    Habits lie in the range of the seen six, a fifth wider; those who are only tested have no part in it.
     """
     random = np.random.default_rng([number, 2])
     members = [CAST[name] for name in SEEN]

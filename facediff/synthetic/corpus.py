@@ -68,13 +68,10 @@ class PerformedClip:
     """One clip.
 
     Attributes:
-        identity: who speaks.
-        split: ``train``, ``val``, ``test_a``, ``test_b``, ``test_c``, or ``references`` for clips of unseen speakers
-            in no split.
+        split: as of a data module, or ``references`` for clips of unseen speakers in no split.
         number: of the sentence in its list, from 1.
-        text: words of the clip.
         mood: a name in :data:`facediff.synthetic.performance.MOODS`.
-        voice: what speaks, where it is not the speaker's own voice.
+        voice: where it is not the speaker's own.
     """
 
     identity: str
@@ -145,14 +142,7 @@ def mask_clips() -> tuple[PerformedClip, ...]:
 
 @dataclass(frozen=True)
 class CorpusVariant:
-    """What differs between the corpora that are made here.
-
-    Attributes:
-        corpus: name in ``manifest.json``.
-        mesh_file: file with the faces.
-        frame_rate: motion frames a second.
-        mask: whether the motion is of the mask instead of the whole head.
-    """
+    """What differs between the corpora that are made here: of the whole head, and of the mask."""
 
     corpus: str = CORPUS
     mesh_file: str = "PUPPET.ply"
@@ -224,12 +214,12 @@ def generate(
 
     Args:
         root: the folder to make.
-        seed: random seed; the same seed gives the same bytes.
+        seed: the same seed gives the same bytes.
         drawn: how many drawn speakers say training sentences, besides the cast of ten.
         people: voices of people: recordings of people, each of whom is a speaker more, and others
             (:func:`people_voices`), with which every second drawn speaker speaks.
-        workers: how many workers share the work; by default one, or all of a cluster.
-        scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
+        workers: by default one, or all of a cluster.
+        scheduler: see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
         only: names of clips to write instead of all, for trials; such a corpus never counts as complete.
         variant: the corpus itself, or the second one with the mask.
@@ -371,17 +361,8 @@ def perform_clip(
 
 def _write_common(folder: Path, clips: Sequence[PerformedClip], people: Sequence[str], variant: CorpusVariant) -> None:
     """Write everything that is not a clip."""
-    for name in (
-        "wav",
-        "vertices_npy",
-        "weights_npy",
-        "gaze_npy",
-        "head_npy",
-        "another_weights_npy",
-        "rigs",
-        "phonemes",
-        "regions",
-    ):
+    arrays = [f"{name}_npy" for name in ("vertices", "weights", "gaze", "head", "another_weights")]
+    for name in ("wav", "rigs", "phonemes", "regions", *arrays):
         (folder / name).mkdir()
     mesh = build_head()
     templates = {}
@@ -466,16 +447,10 @@ def _refuse_other(root: Path, facts: dict[str, object]) -> None:
 
 def _write_ply(path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], colours: NDArray[np.uint8]) -> None:
     """Write a triangle mesh (V, 3), (F, 3) with colours (V, 3) in red, green, blue as binary little-endian PLY."""
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += ["property float x", "property float y", "property float z"]
+    header += ["property uchar red", "property uchar green", "property uchar blue"]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
     points = np.empty(len(vertices), dtype=[("place", "<f4", 3), ("colour", "u1", 3)])
     points["place"], points["colour"] = vertices, colours
     corners = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])

@@ -28,12 +28,10 @@ class KnownFace:
     """The speaker of the built-in corpus that a face is most like; lengths in metres.
 
     Attributes:
-        speaker: name of the speaker.
         distance: largest distance of a vertex from the speaker's.
         lids: vertices of the upper and the lower lid's edge from one corner to the other, of both eyes.
         eyeballs: vertices of each eyeball.
-        closing: way of each vertex in a blink of the speaker, (V, 3).
-        brows_up, brows_down: the same for raised and for lowered brows.
+        closing, brows_up, brows_down: way of each vertex (V, 3) in a blink and with raised and lowered brows.
     """
 
     speaker: str
@@ -88,11 +86,7 @@ def resting_heads() -> Mapping[str, Array]:
 
 
 def built_in_shapes(speaker: str | None = None) -> tuple[Array, Index, dict[str, Array]]:
-    """A built-in head at rest (V, 3) in metres, its triangles, and its shapes by ARKit's names, each (V, 3).
-
-    Args:
-        speaker: a speaker of the corpus; the average head if None.
-    """
+    """A speaker's head (the average one if None) at rest (V, 3) in metres, its triangles, and ARKit's shapes (V, 3)."""
     check_known("--identity", "speaker", [] if speaker is None else [speaker], CAST)
     mesh = build_head()
     if speaker is None:
@@ -112,11 +106,7 @@ def built_in_rig(speaker: str | None = None) -> LinearRig:
 
 
 def write_puppet_shapes(folder: Path, speaker: str | None = None) -> list[str]:
-    """Write the shapes as OBJ files, and the face at rest as ``neutral.obj``; the folder appears whole or not at all.
-
-    Returns:
-        the names of the shapes.
-    """
+    """Write the shapes as OBJ files, and the face at rest as ``neutral.obj``; gives the names of the shapes."""
     neutral, faces, shapes = built_in_shapes(speaker)
     triangles = "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1)
     with atomic_folder(folder) as temporary:

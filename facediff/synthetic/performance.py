@@ -121,8 +121,7 @@ class FaceMotion:
     """The motion of a clip.
 
     Attributes:
-        weights: of the rig's shapes, (T, 54), in the order of :data:`facediff.synthetic.head.rig.SHAPES`; the eyes'
-            turns are part of them.
+        weights: (T, 54) of :data:`facediff.synthetic.head.rig.SHAPES`, the eyes' turns included.
         gaze: where the eyes look, to the face's left and up in degrees, (T, 2).
         head: pitch (chin down), yaw (to its left) and roll (towards its left shoulder) in degrees, (T, 3).
     """

@@ -61,13 +61,7 @@ _MANDARIN = (
 
 @dataclass(frozen=True)
 class Language:
-    """The sentences of a language and the voices that speak them.
-
-    Attributes:
-        name: in English.
-        voices: in order of preference; voices of missing programs are left out.
-        sentences: in which no model of the built-in corpus was trained.
-    """
+    """A language's name, voices in order of preference, and sentences that are in no training data."""
 
     name: str
     voices: tuple[str, ...]
@@ -87,16 +81,7 @@ LANGUAGES = {
 
 @dataclass(frozen=True)
 class SpokenClip:
-    """A sentence as one voice speaks it, with quiet at both ends.
-
-    Attributes:
-        name: stem of its files.
-        language: a code in :data:`LANGUAGES`.
-        voice: as :func:`facediff.synthetic.voices.open_voice` takes it.
-        text: words of the clip.
-        samples: (S,) at 16 kHz.
-        phonemes: without gaps.
-    """
+    """A sentence as one voice speaks it, (S,) at 16 kHz with quiet at both ends, and its phonemes without gaps."""
 
     name: str
     language: str
@@ -150,14 +135,11 @@ def write_spoken_set(clips: Sequence[SpokenClip], folder: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class OpenFace:
-    """The face that models are put on, and which of its vertices are looked at.
+    """The face that models are put on, in metres, and which of its vertices are looked at.
 
     Attributes:
-        rig: the face at rest with ARKit's shapes, in metres.
         points: vertices that are looked at, sorted; the other fields are places among them.
-        lip_pairs: (P, 2) of the inner lips, upper and lower.
-        lid_pairs: (P, 2) of the eyelids.
-        lips: both lips.
+        lip_pairs, lid_pairs: (P, 2) of the inner lips and of the eyelids, upper and lower.
         upper_face: forehead, brows and around the eyes.
     """
 
@@ -176,11 +158,9 @@ class OpenFace:
 
 @dataclass(frozen=True, eq=False)
 class SpokenMotion:
-    """A motion for a clip.
+    """A motion for a clip: points (T, P, 3) of the open face in metres, and turns (T, 3) of the head (axis-angle).
 
-    Attributes:
-        points: (T, P, 3) of the open face in metres; or (T, C, 1), the face's channels, where no face could be made.
-        head: (T, 3) how the head turns, axis-angle in radians; None if nothing is said of it.
+    Where no face could be made, the points are the face's channels (T, C, 1).
     """
 
     points: Array

@@ -31,13 +31,7 @@ _SEMITONE = 2.0 ** (1.0 / 12.0)
 
 @dataclass(frozen=True)
 class Delivery:
-    """How a voice says a sentence.
-
-    Attributes:
-        rate: speed as a factor.
-        pitch: semitones above the voice's own pitch.
-        pitch_range: range of the melody as a factor.
-    """
+    """How a voice says a sentence: factors of its speed and of its melody's range, semitones above its own pitch."""
 
     rate: float = 1.0
     pitch: float = 0.0
@@ -45,13 +39,7 @@ class Delivery:
 
 
 class Synthesiser(ABC):
-    """A program that speaks, with one of its voices.
-
-    Subclass it and register the subclass as a ``puppet_voice`` to add a synthesiser.
-
-    Args:
-        voice: the name of one of its voices.
-    """
+    """A program that speaks, with one of its voices; register a subclass as a ``puppet_voice`` to add one."""
 
     install: ClassVar[str]
     """How to install the program, for an error."""

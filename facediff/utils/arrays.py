@@ -25,10 +25,10 @@ def open_array(path: Path, *, kinds: str = "", mode: Literal["r", "c"] = "r", na
 
     Args:
         path: the file.
-        kinds: NumPy's letters for the kinds of numbers that are accepted, of which there must be at least one: ``f``
-            for floating point, ``fiu`` for whole numbers as well; anything if empty.
+        kinds: NumPy's letters for the kinds of numbers that are accepted, of which there must be at least one; any if
+            empty.
         mode: ``r``, or ``c`` for an array that may be written to without changing the file.
-        name: what messages call the file, e.g. the option that names it; its path if empty.
+        name: the file in messages, such as the option that names it.
     """
     name = name or str(path)
     # A damaged header makes NumPy raise anything.
@@ -70,14 +70,7 @@ def vertices_of(shape: tuple[int, ...]) -> int | None:
 def read_arrays(
     path: Path, keys: Container[str] | None = None, *, name: str = "", remedy: str = "write it again"
 ) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of a ``.npz`` file, by name.
-
-    Args:
-        path: the file.
-        keys: the arrays to read; all if None.
-        name: what messages call the file; its path if empty.
-        remedy: what messages advise.
-    """
+    """The arrays of a ``.npz`` file by name: of ``keys``, or all; messages call it ``name`` and end in ``remedy``."""
     # zipfile, zlib and NumPy each have several exceptions for damaged files.
     with damaged(f"{name or path}: not a readable .npz file", remedy, Exception), _PARSING, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
@@ -87,12 +80,7 @@ def read_arrays(
 
 
 class ArrayWriter:
-    """A .npy file of float32 that grows row by row, so that memory does not hold a long motion.
-
-    Args:
-        path: the file; its header is valid after :meth:`close`, or at the end of a ``with``.
-        row: shape of a row, such as (V, 3) of a frame.
-    """
+    """A .npy file of float32 that grows by rows of a shape; its header is valid at the end of a ``with``."""
 
     def __init__(self, path: Path, row: tuple[int, ...]) -> None:
         self.row = row
@@ -124,11 +112,7 @@ def write_header(stream: IO[bytes], shape: tuple[int, ...]) -> None:
 
 
 class ArrayStore:
-    """A folder of arrays by key, kept between runs. Anything in it may be removed at any time: it is made again.
-
-    Args:
-        folder: where the arrays lie; made when the first one is put in.
-    """
+    """A folder of arrays by key, kept between runs; anything in it may be removed at any time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -87,14 +87,11 @@ def begin_folder(
 ) -> None:
     """Begin or continue a folder, which a killed run has left; a folder of anything else is refused.
 
-    While ``state`` is there, readers refuse the folder: remove it when the last file is written. The caller holds a
-    lock.
-
     Args:
-        out: the folder.
-        state: file in it that holds the recipe while the folder is unfinished.
+        out: the folder; the caller holds a lock.
+        state: file in it that holds the recipe while the folder is unfinished, in which time readers refuse it.
         recipe: all that determines the bytes of the output, plain data; a run is continued only with the same.
-        command: what writes it, for messages.
+        command: for messages.
         complete: the recipe of a finished folder that lacks something.
     """
     recipe = parse_json(json.dumps(recipe), state)  # as the file will hold it: lists, no tuples

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-import logging
 import os
 import pickle  # noqa: S403 - what a run sends its own workers, over the connection that Dask itself sends pickles by
 import platform
@@ -41,9 +40,6 @@ CONNECTING = 10.0
 """Seconds that a scheduler has to answer."""
 PATIENCE = 60.0
 """Seconds that a cluster may be without any worker before the work is given up; workers that restart take a few."""
-FEW = 20
-"""Names of a folder that workers are asked for."""
-LOGGERS = ("distributed", "distributed.client", "distributed.worker", "tornado.application", "asyncio")
 LOST = "the scheduler was lost; start it again, and run the same command again, which continues"
 SAME = "install the same packages on all machines, and start the workers again"
 
@@ -62,22 +58,11 @@ class ClusterRun:
     python: str = platform.python_version().rpartition(".")[0]
 
 
-def fingerprint(path: str) -> int | tuple[str, ...] | None:
-    """A file's size, or a few names out of a folder, by which another machine finds out whether it sees the same."""
-    try:
-        if not os.path.isdir(path):
-            return os.stat(path).st_size
-        names = sorted(name for name in os.listdir(path) if not name.startswith("."))
-        return tuple(names[:: max(1, len(names) // FEW)])
-    except OSError:
-        return None
-
-
-def matches(path: str, expected: object) -> bool:
-    """Whether a path has a :func:`fingerprint` that another machine has found; a folder may have more by now."""
-    if isinstance(expected, tuple):
-        return os.path.isdir(path) and all(os.path.lexists(os.path.join(path, name)) for name in expected)
-    return fingerprint(path) == expected
+def fingerprint(path: str) -> int | None:
+    """A file's size, 0 of a folder: by it, another machine finds out whether it sees the same."""
+    if os.path.isdir(path):
+        return 0
+    return os.path.getsize(path) if os.path.isfile(path) else None
 
 
 # The client.
@@ -98,7 +83,6 @@ def run_on_cluster(
     import cloudpickle
 
     with ExitStack() as stack:
-        stack.enter_context(quiet())
         client = stack.enter_context(connected(scheduler))
         files: dict[str, object] = {str(path.absolute()): fingerprint(str(path)) for path in reads}
         if writes is not None:
@@ -120,7 +104,7 @@ def results_of(
     scheduler: str,
     limit: int,
 ) -> Generator[tuple[Task, Any]]:
-    """Tasks with their results, as they are done; no worker gets a second task before it is free."""
+    """Tasks with their results; no worker gets a second task before it is free."""
     import cloudpickle
 
     refuse_unfit(client, run, scheduler)
@@ -214,22 +198,6 @@ def own_environment() -> dict[str, str]:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Keep Dask from logging errors that are reported here."""
-    import distributed  # noqa: F401 - which chooses levels of its own when it is imported
-
-    loggers = [logging.getLogger(name) for name in LOGGERS]
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
-
-
-@contextmanager
 def connected(scheduler: str) -> Iterator[Any]:
     """A client of the scheduler."""
     import distributed
@@ -262,7 +230,7 @@ def problem(run: ClusterRun) -> str:
     if not os.path.isdir(run.folder):
         return f"does not see the folder {run.folder}; run on storage that all machines share"
     for path, expected in run.files.items():
-        if not matches(path, expected):
+        if fingerprint(path) != expected:
             folder = os.path.dirname(os.path.dirname(path)) if path.endswith(f"{os.sep}token") else path
             return f"does not see the same {folder}; use storage that all machines share, under one name"
     return ""

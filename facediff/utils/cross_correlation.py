@@ -9,13 +9,9 @@ Array = npt.NDArray[np.float64]
 
 
 def lagged_correlation(late: Array, early: Array, lag: int, least: int) -> float:
-    """Pearson's correlation of what overlaps where ``early`` begins ``lag`` steps into ``late``.
+    """Pearson's correlation of two series where ``early`` begins ``lag`` steps into ``late``.
 
-    Args:
-        late: a series.
-        early: another one.
-        lag: steps, of either sign.
-        least: steps that must overlap; the correlation is −∞ otherwise.
+    It is −∞ where fewer than ``least`` steps overlap.
     """
     first, last = max(0, -lag), min(len(early), len(late) - lag)
     if last - first < least:
@@ -32,13 +28,7 @@ def correlations(late: Array, early: Array, furthest: int, least: int) -> Array:
 
 
 def peak(scores: Array) -> float:
-    """Where correlations of :func:`correlations` are highest, in steps: a parabola through the best three has its top.
-
-    Example:
-        >>> early = np.sin(np.arange(60) / 3.0)
-        >>> round(peak(correlations(np.roll(early, 2)[5:], early[5:], 6, 20)), 1)
-        2.0
-    """
+    """The lag at which :func:`correlations` are highest, in steps: the top of a parabola through the best three."""
     best = int(scores.argmax())
     shift = 0.0
     if 0 < best < len(scores) - 1 and np.isfinite(scores[best - 1 : best + 2]).all():

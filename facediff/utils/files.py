@@ -31,10 +31,7 @@ def cache_dir() -> Path:
 
 
 def config_dir() -> Path:
-    """The folder of the bundled configs (``experiment/``, ``model/``, ``data/``, ``trainer/``).
-
-    It lies inside an installed package, and next to the package in a checkout.
-    """
+    """The folder of the bundled configs: inside an installed package, and next to the package in a checkout."""
     package = Path(__file__).parents[1]
     inside = package / "configs"
     return inside if inside.is_dir() else package.parent / "configs"
@@ -58,16 +55,8 @@ def atomic(path: Path) -> Iterator[Path]:
     owner and its permissions on.
 
     Yields:
-        a temporary path next to the file, which is renamed at the end and removed if anything fails. It has the suffix
-        of ``path``, since many writers choose the format by it.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "results" / "table.csv"
-        >>> with atomic(path) as temporary:
-        ...     _ = temporary.write_text("clip,lve\n")
-        >>> path.read_text()
-        'clip,lve\n'
+        a path next to the file, renamed at the end and removed if anything fails, with the same suffix, since many
+        writers choose the format by it.
     """
     with _writing(path):
         target = destination(path)
@@ -86,15 +75,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def discard(path: Path) -> None:
-    """Remove a file or folder, if it is there, also where a signal ends the command while it is being removed."""
-    try:
-        _remove(path)
-    except BaseException:  # a signal; it comes once
-        _remove(path)
-        raise
-
-
-def _remove(path: Path) -> None:
+    """Remove a file or folder, if it is there."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -111,15 +92,10 @@ def refuse_content(path: Path, *, replace: bool = False) -> None:
 
 @contextmanager
 def atomic_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Write a folder whole or not at all.
-
-    Args:
-        path: the folder that shall appear.
-        replace: whether a folder with content may be replaced; an empty one always is.
+    """Write a folder whole or not at all; one with content only to ``replace`` it.
 
     Yields:
-        a hidden folder next to ``path``, to be filled. It is renamed to ``path`` at the end and removed if anything
-        fails; leftovers of a killed process are removed by the next one that writes the folder.
+        a hidden folder next to ``path``, to be filled; it is renamed at the end and removed if anything fails.
     """
     refuse_content(path, replace=replace)
     with scratch_folder(path) as scratch:
@@ -317,10 +293,7 @@ def sweep(folder: Path) -> None:
 
 
 def reserve_room(path: Path) -> None:
-    """Take the room of a file that is to be written through a memory map.
-
-    Without it, a disk that fills up ends the process (SIGBUS) in the middle of an assignment.
-    """
+    """Take the room of a file that is to be written through a memory map: a full disk would end the process then."""
     with path.open("r+b") as stream:
         if hasattr(os, "posix_fallocate") and (size := path.stat().st_size):
             os.posix_fallocate(stream.fileno(), 0, size)
@@ -330,7 +303,7 @@ def remove_partial(folder: Path, stem: str = "*", *, recursive: bool = False) ->
     """Remove what killed processes have left of files named ``stem``; no other process may be writing there."""
     pattern = f".{stem if stem == '*' else glob.escape(short_name(stem, LONGEST))}.partial-*"
     for left in list(folder.rglob(pattern) if recursive else folder.glob(pattern)):
-        _remove(left)
+        discard(left)
 
 
 @contextmanager

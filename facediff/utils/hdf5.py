@@ -22,12 +22,7 @@ Array = npt.NDArray[np.float64]
 
 
 def read_frames(path: Path, widths: Mapping[str, int]) -> dict[str, Array]:
-    """Datasets of a file by name, each (T, D) float64; the file may have others.
-
-    Args:
-        path: the file.
-        widths: names of the datasets, with the most columns that each may have; rotations (3) have exactly so many.
-    """
+    """Datasets of a file by name, each (T, D) float64, with ``widths`` columns at most; rotations have exactly 3."""
     with needs_extra("h5py", "prepare", "reading FLAME reconstructions (.hdf5)"):
         import h5py
     remedy = f"expected {', '.join(widths)} as in shape_pose_cam.hdf5; get the file again if it is truncated"
@@ -46,13 +41,9 @@ def read_frames(path: Path, widths: Mapping[str, int]) -> dict[str, Array]:
 
 
 def as_frames(values: npt.NDArray[np.generic], columns: int, where: str, *, exact: bool) -> Array:
-    """(T, D) from (1, T, D), the way in which these projects keep a batch of one.
+    """(T, D) from (1, T, D), the way in which these projects keep a batch of one; ``where`` names it in messages.
 
-    Args:
-        values: as the file has them.
-        columns: how many columns there may be.
-        where: what messages call them.
-        exact: whether there are exactly so many; of shape and expression, the last coefficients may be left out.
+    There are exactly so many columns, or at most: the last coefficients of shape and expression may be left out.
     """
     frames = values[0] if values.ndim == 3 and len(values) == 1 else values
     fits = frames.dtype.kind in "fiu" and frames.ndim == 2 and len(frames)

@@ -50,17 +50,8 @@ class Range:
     """The numbers that an argument or an option takes: ``Annotated[float, Range(0, 1)]``. NaN and infinity never.
 
     Attributes:
-        least: the smallest number, which is included unless ``above`` is set.
-        most: the largest number, which is included unless ``below`` is set.
-        above: whether ``least`` itself is left out.
-        below: whether ``most`` itself is left out.
+        above, below: whether ``least`` and ``most`` themselves are left out.
         items: for lists, in which every item must lie in the range, the fewest and the most items.
-
-    Example:
-        >>> 0.5 in Range(0, 1, below=True)
-        True
-        >>> print(Range(0, 1, below=True))
-        from 0 to below 1
     """
 
     least: float = -math.inf
@@ -140,10 +131,6 @@ def fits(hint: Any, value: object, limits: Range = Range(), *, stored: bool = Fa
         limits: of numbers, where the hint states none.
         stored: whether a file states the value. Then it must be plain data that cannot be read as anything but itself:
             Lightning and jsonargparse import class paths, open configs and resolve ``${…}`` wherever a value lets them.
-
-    Example:
-        >>> fits(int, 3), fits(int, "3"), fits(Callable[..., None], "os.system", stored=True)
-        (True, False, False)
     """
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
@@ -201,22 +188,12 @@ def _entries_fit(inner: tuple[Any, ...], value: object, *, stored: bool) -> bool
 
 
 def mismatch(hint: Any, value: object) -> str | None:  # noqa: ANN401 - a type hint
-    """The words for a type hint that a value does not fit; None if it fits.
-
-    Example:
-        >>> mismatch(Annotated[int, Range(1, 8)], 9)
-        'a whole number from 1 to 8'
-    """
+    """The words for a type hint that a value does not fit; None if it fits."""
     return None if fits(hint, value) else describe(hint)
 
 
 def describe(hint: Any, limits: Range = Range()) -> str:  # noqa: ANN401, B008 - a type hint; a frozen dataclass
-    """A type hint in words.
-
-    Example:
-        >>> describe(Annotated[float, Range(0, 1)] | None)
-        'a number from 0 to 1 or null'
-    """
+    """A type hint in words."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return describe(inner[0], next((extra for extra in inner[1:] if isinstance(extra, Range)), limits))
@@ -238,12 +215,7 @@ def describe(hint: Any, limits: Range = Range()) -> str:  # noqa: ANN401, B008 -
 
 
 def convert(hint: Any, value: Any) -> Any:  # noqa: ANN401 - a type hint and its value
-    """Plain data that fits a hint, in the form that the hint asks for; undoes :func:`facediff.hyperparameters.plain`.
-
-    Example:
-        >>> convert(tuple[int, ...] | None, [1, 2])
-        (1, 2)
-    """
+    """Plain data that fits a hint, in its form; undoes :func:`facediff.hyperparameters.plain`."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return convert(inner[0], value)
@@ -257,12 +229,7 @@ def convert(hint: Any, value: Any) -> Any:  # noqa: ANN401 - a type hint and its
 
 
 def read(hint: Any, word: str) -> Any:  # noqa: ANN401 - a type hint and its value
-    """A word of the command line as a value of a hint; numbers in ASCII digits, without underscores or blanks.
-
-    Example:
-        >>> read(Annotated[float, Range(0, 1)] | None, "0.5"), read(bool, "true"), read(str, "0.5")
-        (0.5, True, '0.5')
-    """
+    """A word of the command line as a value of a hint; numbers in ASCII digits, without underscores or blanks."""
     options = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     for option in options:
         bare = get_args(option)[0] if get_origin(option) is Annotated else option
@@ -296,10 +263,6 @@ def check_number(
     """The number ``name`` of a file (``source``) if it lies in a range and is ``whole`` where asked for.
 
     As ``text``, as tables hold it, it is read; ``remedy`` ends the message.
-
-    Example:
-        >>> check_number("manifest.json", "frame_rate", 25, 0.1, 1000)
-        25.0
     """
     number = value
     if text and isinstance(value, str):
@@ -380,16 +343,7 @@ def check_options(options: Any) -> None:  # noqa: ANN401 - an instance of a data
 
 
 def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Decorator that refuses arguments outside the ranges of their type hints. None is allowed.
-
-    Example:
-        >>> @checked
-        ... def half(share: Annotated[float, Range(0, 1)]) -> float:
-        ...     return share / 2
-        >>> half(2.0)
-        Traceback (most recent call last):
-        facediff.errors.FaceDiffError: half.share 2.0: out of range; expected a number from 0 to 1
-    """
+    """Decorator that refuses arguments outside the ranges of their type hints. None is allowed."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)

@@ -10,12 +10,7 @@ from collections.abc import Mapping
 
 
 def hash_source(text: str) -> str:
-    """A script or style as a content security policy names it, so that it alone may run.
-
-    Example:
-        >>> hash_source("")
-        "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='"
-    """
+    """A script or style as a content security policy names it, so that it alone may run."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
@@ -31,10 +26,5 @@ def script_data(facts: Mapping[str, object]) -> str:
 
 
 def fill(template: str, values: Mapping[str, str]) -> str:
-    """Put values into the places ``{{name}}`` in one pass, so that a value is never searched for places.
-
-    Example:
-        >>> fill("<b>{{one}}</b>", {"one": "{{two}}"})
-        '<b>{{two}}</b>'
-    """
+    """Put values into the places ``{{name}}`` in one pass, so that a value is never searched for places."""
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)

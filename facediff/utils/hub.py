@@ -41,12 +41,7 @@ _ID = re.compile(r"(?P<name>[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:@
 
 
 def hub_id(source: str | os.PathLike[str]) -> tuple[str, str | None] | None:
-    """Name and revision of a model on the hub; None for what can be no such name, or is a path of this machine.
-
-    Example:
-        >>> hub_id("ada/talking-face@v1"), hub_id("demo/puppet.ckpt"), hub_id("./ada/face")
-        (('ada/talking-face', 'v1'), None, None)
-    """
+    """Name and revision of a model on the hub; None for what can be no such name, or is a path of this machine."""
     text = os.fspath(source)
     match = _ID.fullmatch(text)
     if match is None or os.path.lexists(text) or match["name"].endswith((".ckpt", ".pt", ".pth", ".safetensors")):

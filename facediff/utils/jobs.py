@@ -122,10 +122,6 @@ def run_tasks(
     Yields:
         task and result. The result of a task that kills its process is :class:`WorkerDied`: tasks that were running
         then are tried again, one at a time, so that no other is lost.
-
-    Example:
-        >>> dict(run_tasks(len, ["a", "bb"], mode="threads"))
-        {'a': 1, 'bb': 2}
     """
     where = check_scheduler(scheduler) if scheduler != "" else ""
     count = min(workers or processors(), len(tasks), MOST_WORKERS * processors())

@@ -47,14 +47,7 @@ SPEECH_NETWORKS = {
 
 @dataclass(frozen=True)
 class Licence:
-    """The terms of one thing that a model was made from.
-
-    Attributes:
-        of: the licensed thing, such as ``corpus biwi`` or ``weights``.
-        name: the licence, such as ``Apache-2.0``, or the terms in a few words.
-        commercial: whether it allows commercial use.
-        source: where that stands.
-    """
+    """The terms (``name``) of one thing that a model was made ``of``, such as ``weights``, and where they stand."""
 
     of: str
     name: str = "unknown"
@@ -70,12 +63,7 @@ class Licence:
 
 
 def commercial_use(licences: Iterable[Licence]) -> Commercial:
-    """Commercial use by the strictest of several licences; unknown if there are none.
-
-    Example:
-        >>> commercial_use([Licence("corpus puppet", "Apache-2.0", "allowed"), Licence("speaker Eva")])
-        'unknown'
-    """
+    """Commercial use by the strictest of several licences; unknown if there are none."""
     order = get_args(Commercial)
     return max((licence.commercial for licence in licences), key=order.index, default="unknown")
 
@@ -86,24 +74,14 @@ def merged(*groups: Iterable[Licence]) -> tuple[Licence, ...]:
 
 
 def in_words(licences: Iterable[Licence]) -> str:
-    """All licences in one line, for messages and the metadata of files.
-
-    Example:
-        >>> in_words([Licence("corpus puppet", "Apache-2.0", "allowed")])
-        'corpus puppet: Apache-2.0; commercial use allowed'
-    """
+    """All licences in one line, for messages and the metadata of files."""
     labels = list(licences)
     names = "; ".join(f"{label.of}: {label.name}" for label in labels) or "unknown"
     return f"{names}; commercial use {commercial_use(labels)}"
 
 
 def licence_metadata(licences: Iterable[Licence]) -> dict[str, str]:
-    """The entries of an animation's metadata.
-
-    Example:
-        >>> licence_metadata([Licence("corpus puppet", "Apache-2.0", "allowed")])
-        {'licence': 'corpus puppet: Apache-2.0; commercial use allowed', 'commercial_use': 'allowed'}
-    """
+    """The entries of an animation's metadata."""
     labels = list(licences)
     return {"licence": in_words(labels), "commercial_use": commercial_use(labels)}
 

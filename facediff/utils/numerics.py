@@ -70,10 +70,6 @@ class RecursiveFilter:
 
     Args:
         sections: (sections, 6): b0, b1, b2, 1, a1, a2.
-
-    Example:
-        >>> RecursiveFilter([[0.5, 0.5, 0, 1, 0, 0]]).feed(np.array([1.0, 1.0, 0.0]))  # the mean of two samples
-        array([0.5, 1. , 0.5])
     """
 
     def __init__(self, sections: npt.ArrayLike) -> None:

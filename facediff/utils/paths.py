@@ -14,12 +14,7 @@ _HOME = re.compile(r"(?:(?<=[=,:>])|^)~[\w.-]*(?=/|$)")
 
 
 def from_home(value: Value) -> Value:
-    """A path, or a text with paths, in which ``~`` is the user's home; anything else as it is.
-
-    Example:
-        >>> from_home("face=~/face.obj") == f"face={Path.home()}/face.obj", from_home("a~/b"), from_home(3)
-        (True, 'a~/b', 3)
-    """
+    """A path, or a text with paths, in which ``~`` is the user's home; anything else as it is."""
     if not isinstance(value, str | Path) or "~" not in str(value):
         return value
     text = _HOME.sub(lambda home: os.path.expanduser(home[0]), str(value))  # noqa: PTH111 - "~name" may be no user

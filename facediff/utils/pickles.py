@@ -146,11 +146,7 @@ NAMES_OF_OBJECTS: dict[tuple[str, str], Any] = {
 
 
 class PlainUnpickler(pickle.Unpickler):
-    """Unpickles NumPy arrays and plain containers, and nothing else.
-
-    Attributes:
-        stand_ins: packages with objects that become :class:`StandIn`; nothing of these packages is imported.
-    """
+    """Unpickles NumPy arrays and plain containers, and nothing else."""
 
     stand_ins: tuple[str, ...] = ()
 
@@ -165,13 +161,9 @@ class PlainUnpickler(pickle.Unpickler):
 
 
 def load_pickle(path: Path, *, stand_ins: tuple[str, ...] = ()) -> Any:  # noqa: ANN401
-    """Read a pickle that holds NumPy arrays and plain containers.
+    """Read a pickle that holds NumPy arrays and plain containers; of Python 2, as Latin-1, as the field does.
 
-    Files written by Python 2 are read as Latin-1, as all projects of the field do.
-
-    Args:
-        path: the file.
-        stand_ins: packages (``scipy.sparse``) with objects that become :class:`StandIn`.
+    Objects of the packages ``stand_ins`` (``scipy.sparse``) become :class:`StandIn`.
     """
     remedy = "it was not run. Expected the file as the data set's authors distribute it"
     with damaged(f"{path}: not a pickle of plain NumPy arrays", remedy, Exception), path.open("rb") as stream:

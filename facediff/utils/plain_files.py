@@ -19,15 +19,10 @@ from facediff.utils.files import atomic
 
 
 def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a JSON file") -> Any:  # noqa: ANN401
-    """Plain data of a JSON text; no other module parses one.
+    """Plain data of a JSON text, or of its bytes in UTF-8, UTF-16 or UTF-32; no other module parses one.
 
     Python's parser takes NaN, infinity and keys that occur twice, of which the last counts: all would be wrong in
-    silence, and are refused.
-
-    Args:
-        text: the text; of bytes, UTF-8, UTF-16 or UTF-32 with or without a mark.
-        source: what messages call it.
-        remedy: how messages end.
+    silence, and are refused. Messages call the text ``source`` and end in ``remedy``.
     """
     hooks: dict[str, Any] = {"parse_constant": _finite, "parse_float": _finite, "parse_int": _whole}
     with damaged(f"{source}: not readable as JSON", remedy, RecursionError):
@@ -37,13 +32,7 @@ def parse_json(text: bytes | str, source: object, *, remedy: str = "expected a J
 
 
 def load_json(path: Path, *, name: str = "", remedy: str = "expected a JSON file") -> Any:  # noqa: ANN401
-    """Plain data that a JSON file holds, as :func:`parse_json` reads it.
-
-    Args:
-        path: the file.
-        name: what messages call it; its path if empty.
-        remedy: how messages end.
-    """
+    """Plain data that a JSON file holds, as :func:`parse_json` reads it; messages call it ``name``."""
     return parse_json(read_bytes(path, name=name, remedy=remedy), name or path, remedy=remedy)
 
 
@@ -111,12 +100,7 @@ def _is_formula(text: str) -> bool:
 
 
 def csv_cell(value: object) -> object:
-    """A cell that no spreadsheet takes as a formula: ``=cmd()`` becomes ``'=cmd()``; numbers stay as they are.
-
-    Example:
-        >>> [csv_cell(value) for value in ("-0.5", "-clip", -0.5, "A = b")]
-        ['-0.5', "'-clip", -0.5, 'A = b']
-    """
+    """A cell that no spreadsheet takes as a formula: ``=cmd()`` becomes ``'=cmd()``; numbers stay as they are."""
     if not isinstance(value, str) or not _is_formula(value):
         return value
     try:
@@ -150,15 +134,10 @@ def decoded(content: bytes) -> str:
 
 
 def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
-    """Rows of a CSV file from elsewhere, as lists of cells; empty lines are none.
+    """The header and the rows of a CSV file from elsewhere, in cells of :func:`csv_text`, without empty lines.
 
-    Args:
-        path: UTF-8, or what spreadsheets save as Unicode text (UTF-16), with commas or tabs between cells, or with the
-            character of a first line such as ``sep=;``. Blanks around cells do not count.
-        remedy: how messages end.
-
-    Yields:
-        the cells as :func:`csv_text` gives them; the header is the first.
+    It is UTF-8, or what spreadsheets save as Unicode text (UTF-16), with commas or tabs between cells, or with the
+    character of a first line such as ``sep=;``. Blanks around cells do not count.
     """
     with damaged(f"{path}: not readable as a UTF-8 table", remedy, OSError, csv.Error):
         text = decoded(path.read_bytes())
@@ -175,12 +154,9 @@ def read_table(path: Path, *, remedy: str) -> Iterator[list[str]]:
 
 
 def read_columns(path: Path, names: Iterable[str] = (), *, remedy: str) -> tuple[list[str], Iterator[list[str]]]:
-    """The header of a CSV file and its rows; a column that occurs twice is an error.
+    """The header and the rows of a file of :func:`read_table`; a column that occurs twice is an error.
 
-    Args:
-        path: as :func:`read_table` takes it.
-        names: columns of which the case does not count; the header has them as they are here.
-        remedy: how messages end.
+    The case of ``names`` does not count; the header has them as they are here.
     """
     rows = read_table(path, remedy=remedy)
     spelling = {name.casefold(): name for name in names}
@@ -191,10 +167,7 @@ def read_columns(path: Path, names: Iterable[str] = (), *, remedy: str) -> tuple
 
 
 def read_rows(path: Path, names: Iterable[str] = (), *, remedy: str) -> Iterator[dict[str, str]]:
-    """Rows of a CSV file with a header, by column; cells that a row lacks are empty, and further ones are left out.
-
-    Arguments and errors are as for :func:`read_columns`.
-    """
+    """Rows of :func:`read_columns` by column; cells that a row lacks are empty, and further ones are left out."""
     header, rows = read_columns(path, names, remedy=remedy)
     for row in rows:
         yield dict(zip(header, row + [""] * (len(header) - len(row)), strict=False))

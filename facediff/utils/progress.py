@@ -26,15 +26,7 @@ def progress_bar(
 ) -> Iterator[Callable[[], object]]:
     """A progress bar of ``total`` steps (None if that is not known), ``done`` of which have been done before.
 
-    Where there is no terminal, a line says every minute how far it is; what takes less says nothing.
-
-    Yields:
-        a function to be called after each step.
-
-    Example:
-        >>> with progress_bar("clips", 2, shown=False) as step:
-        ...     for _ in range(2):
-        ...         _ = step()
+    Where there is no terminal, a line says every minute how far it is. The function is called after each step.
     """
     if not shown:
         yield lambda: None

@@ -1,11 +1,7 @@
-"""The origin of a folder of scores or of predictions: ``provenance.json`` next to them.
+"""The origin of a folder of scores or of predictions: ``provenance.json`` in the one, next to the other.
 
-Scores mean little without their training run. The file tells whether two folders are of two methods, or of one method
-that was trained twice: then their difference is chance between training runs, about which the spread over sentences
-says nothing.
-
-A folder of predictions holds nothing but predictions, as other projects' scripts expect; its file lies next to it,
-``<folder>.provenance.json``.
+It tells whether two folders are of two methods, or of one method that was trained twice: then their difference is
+chance between training runs, about which the spread over sentences says nothing.
 """
 
 from __future__ import annotations
@@ -33,16 +29,12 @@ class Provenance:
     """One training run, and the source of its scores or predictions.
 
     Attributes:
-        model: the method's class.
-        components: name of each of its components, by kind.
+        components: their names, by kind.
         recipe: SHA-256 of all options of model and data; runs that differ in the seed alone have the same one.
         seed: of the training run; None where the checkpoint does not know it, as an imported one.
-        steps: optimiser steps of the training.
-        checkpoint: SHA-256 of the checkpoint; empty if the model came from none.
-        corpus: of the scores.
-        manifest: SHA-256 of that corpus's manifest, or ``none``.
+        checkpoint: SHA-256; empty if the model came from none.
+        manifest: SHA-256 of the manifest of the scores' corpus, or ``none``.
         parameters: weights of the network, trained and frozen.
-        versions: of facediff, torch and lightning.
     """
 
     model: str
@@ -80,12 +72,7 @@ class Provenance:
 
 
 def recipe_of(options: Mapping[str, Any]) -> str:
-    """SHA-256 of plain options; it depends neither on their order nor on how numbers were written.
-
-    Example:
-        >>> recipe_of({"dim": 64, "layers": 2}) == recipe_of({"layers": 2, "dim": 64})
-        True
-    """
+    """SHA-256 of plain options; it depends neither on their order nor on how numbers were written."""
     return hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest()
 
 

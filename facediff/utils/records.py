@@ -64,10 +64,10 @@ class Items:
 def read_record(
     kind: type[Record], content: object, source: object, *, remedy: str = "", strict: bool = True, name: str = ""
 ) -> Record:
-    """A dataclass from plain data.
+    """A dataclass from plain data; a field without a default has to be there, and null stands for the default.
 
     Args:
-        kind: the dataclass; a field without a default has to be there, and null stands for the default.
+        kind: the dataclass.
         content: plain data from a file.
         source: the file, for messages.
         remedy: how messages end.

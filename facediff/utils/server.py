@@ -41,12 +41,7 @@ class RefusedError(Exception):
 
 
 def names_of(host: str) -> tuple[str, ...] | None:
-    """The names under which a page is served that listens at an address; None if any may be right.
-
-    Example:
-        >>> names_of("127.0.0.1") == LOOPBACK, names_of("0.0.0.0")
-        (True, None)
-    """
+    """The names under which a page is served that listens at an address; None if any may be right."""
     if host in ("", "0.0.0.0", "::"):  # noqa: S104 - a person has told the command so
         return None
     return tuple(dict.fromkeys((*LOOPBACK, host)))
@@ -63,13 +58,8 @@ def is_own_page(host: str, origin: str | None, hosts: Collection[str] | None, pu
     Args:
         host: of the request, with its port.
         origin: of the page with the script that sends it; None if none does.
-        hosts: names under which the page is served; None if any may be right, as where all addresses are listened at.
-        public_name: name under which a web server in front offers the page, by HTTP or HTTPS; no other name but
-            ``hosts`` and this is right then.
-
-    Example:
-        >>> is_own_page("localhost:80", "http://localhost:80", LOOPBACK), is_own_page("evil.example", None, LOOPBACK)
-        (True, False)
+        hosts: as of :func:`names_of`.
+        public_name: name under which a web server in front offers the page, by HTTP or HTTPS.
     """
     names = {name.lower() for name in (*(hosts or LOOPBACK), *([public_name] if public_name else []))}
     if host and not _HOST.fullmatch(host):  # libraries take other parts of a:1.b and a\@b for the name
@@ -152,7 +142,7 @@ def run_server(
     Args:
         app_of: makes the ASGI application; is given a function that stops the server after the present answer.
         host: address to listen at.
-        port: to listen at; 0 for any free one.
+        port: 0 for any free one.
         ready: called with the page's address as soon as it can be opened.
     """
     import uvicorn

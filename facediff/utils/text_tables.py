@@ -12,19 +12,9 @@ UNLIMITED = 100_000  # width of a table that nothing cuts, in characters
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[object]], *, left: int = 1) -> str:
-    """A table as plain text: no colours, no frame, every cell in full.
+    """A table as plain text: no colours, no frame, every cell in full; None becomes ``-``.
 
-    Args:
-        head: titles of the columns; no titles if empty.
-        rows: cells; None becomes ``-``.
-        left: how many columns, from the left, are aligned to the left. The others, numbers as a rule, are aligned to
-            the right.
-
-    Example:
-        >>> print(format_table(["split", "clips"], [["train", 192], ["test", 24]]))
-        split  clips
-        train    192
-        test      24
+    The first ``left`` columns are aligned to the left, the others, numbers as a rule, to the right.
     """
     stream = io.StringIO()
     print_table(head, rows, left=left, stream=stream)
@@ -34,10 +24,7 @@ def format_table(head: Sequence[str], rows: Iterable[Sequence[object]], *, left:
 def print_table(
     head: Sequence[str], rows: Iterable[Sequence[object]], *, left: int = 1, stream: TextIO | None = None
 ) -> None:
-    """Print a table: with bold titles and within the width of a terminal, or as plain text in full anywhere else.
-
-    The arguments are as for :func:`format_table`; ``stream`` is standard output if None.
-    """
+    """Print a table of :func:`format_table`: within the width of a terminal, or as plain text in full elsewhere."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

@@ -95,18 +95,11 @@ def stand_in_for(name: str) -> Any:  # noqa: ANN401
 
 
 def read_authors_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and the options of another project's checkpoint, on the CPU.
+    """The tensors and the plain options of another project's checkpoint by name, on the CPU.
 
-    Tensors may lie in the file by their names, or under ``state_dict``, ``model`` or ``encoder``; options under
-    ``args``, as an ``argparse.Namespace`` or a dict. Files may hold anything else (optimisers, options of a library),
-    of which nothing is imported or run.
-
-    Args:
-        path: a file of ``torch.save``, or arrays by name (``.npz``), as ``tools/convert_tensorflow.py`` writes them.
-
-    Returns:
-        tensors by name, without a leading ``module.``; and options by name: numbers, texts, lists of these, and paths
-        as texts.
+    The file is one of ``torch.save``, or arrays by name (``.npz``), as ``tools/convert_tensorflow.py`` writes them.
+    Tensors may lie in it by their names, or under ``state_dict``, ``model`` or ``encoder``; options under ``args``, as
+    an ``argparse.Namespace`` or a dict. Of anything else in it, nothing is imported or run.
     """
     import torch
 

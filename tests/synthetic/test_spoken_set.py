@@ -9,7 +9,7 @@ import pytest
 from facediff.spaces.rotations import convert, matrices
 from facediff.speech.audio import read_speech
 from facediff.speech.phonemes import TimedPhoneme, closures, read_phonemes
-from facediff.synthetic.head.rig import SHAPES, turned
+from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.performance import FaceMotion
 from facediff.synthetic.spoken_set import (
     LANGUAGES,
@@ -54,9 +54,11 @@ def test_the_references_head_turns_as_the_corpus_does(monkeypatch: pytest.Monkey
         monkeypatch.setattr(f"facediff.synthetic.spoken_set.{name}", function)
     head = reference(SpokenClip("a_01", "en", "espeak:en", "", np.zeros(0, np.float32), ()), 25).head
     assert head is not None
-    points = np.random.default_rng(0).normal(size=(3, 4, 3))
-    found = points @ matrices(convert(head, "axis_angle", "quaternion")).transpose(0, 2, 1)
-    np.testing.assert_allclose(found, turned(points, angles, np.zeros(3)), atol=1e-9)
+    turns = matrices(convert(head, "axis_angle", "quaternion"))
+    assert turns[0, 1, 2] < 0  # a positive pitch takes the nose down
+    assert turns[1, 0, 2] > 0  # a positive yaw turns the face to its left, where x grows
+    assert turns[2, 0, 1] > 0  # a positive roll leans the crown towards the left shoulder
+    np.testing.assert_allclose(np.linalg.norm(head, axis=1), np.deg2rad(2))
 
 
 def test_speech_for_other_programs_is_what_was_spoken(tmp_path: Path) -> None:

@@ -112,16 +112,6 @@ def test_workers_that_see_other_files_are_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_may_grow_but_not_lack_names(tmp_path: Path) -> None:
-    (tmp_path / "a").touch()
-    facts = cluster.fingerprint(str(tmp_path))
-    (tmp_path / "b").touch()
-    assert cluster.matches(str(tmp_path), facts)
-    (tmp_path / "a").unlink()
-    assert not cluster.matches(str(tmp_path), facts)
-    assert not cluster.matches(str(tmp_path / "none"), facts)
-
-
 @pytest.mark.parametrize(("field", "value"), [("version", "0.0.1"), ("python", "2.7"), ("folder", "/not/there")])
 def test_workers_of_another_version_or_without_the_folder_refuse(field: str, value: str) -> None:
     run = cluster.ClusterRun("name", os.getcwd(), (), {}, {}, b"")

@@ -16,7 +16,6 @@ from facediff.utils.files import (
     atomic,
     atomic_folder,
     check_writable,
-    discard,
     locked,
     put_in_place,
     reserve_room,
@@ -256,32 +255,6 @@ def test_a_folder_that_may_not_be_written_is_refused_before_a_writer_has_its_own
     monkeypatch.setattr(os, "access", lambda path, mode: not (Path(path) == tmp_path and mode == os.W_OK))
     with pytest.raises(FaceDiffError, match=r"a\.yaml"), atomic(tmp_path / "a.yaml"):
         raise TypeError("path is not creatable")
-
-
-@pytest.mark.parametrize("folder", [False, True])
-def test_what_is_given_up_is_removed_though_a_signal_comes_meanwhile(
-    folder: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A signal raises wherever the command is, also at the first step of removing."""
-    path = tmp_path / "partial"
-    if folder:
-        path.mkdir()
-        (path / "part").touch()
-    else:
-        path.touch()
-    came: list[int] = []
-    whole = Path.is_dir
-
-    def is_dir(self: Path, **options: bool) -> bool:
-        if not came:
-            came.append(1)
-            raise KeyboardInterrupt
-        return whole(self, **options)
-
-    monkeypatch.setattr(Path, "is_dir", is_dir)
-    with pytest.raises(KeyboardInterrupt):
-        discard(path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_room_is_taken_before_a_map_is_written(tmp_path: Path) -> None:

@@ -30,11 +30,6 @@ def test_a_table_without_titles_or_rows() -> None:
     assert format_table(["a", "b"], []) == "a  b"
 
 
-def test_a_printed_table_has_no_colours_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
-    print_table(["a"], [["b" * 300]])
-    assert capsys.readouterr().out.split() == ["a", "b" * 300]
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True

@@ -19,25 +19,15 @@ HairStyle = Literal["short", "cropped", "bald", "bob", "long", "bun"]
 
 @dataclass(frozen=True)
 class _Cut:
-    """The shape of a style.
-
-    Attributes:
-        top: thickness on the top of the head.
-        sides: thickness at the sides and the back.
-        quiff: additional distance of the hair over the forehead.
-        falls: angles round the head between which the hair begins to fall below the hairline.
-        end: height at which falling hair ends.
-        over_ears: how far it stands off there.
-        knot: how far a knot at the back of the head stands out.
-    """
+    """The shape of a style: how far the hair stands off, in mm."""
 
     top: float
-    sides: float
-    quiff: float = 0.0
-    falls: tuple[float, float] | None = None
-    end: float = 0.0
+    sides: float  # And the back
+    quiff: float = 0.0  # More than that, over the forehead
+    falls: tuple[float, float] | None = None  # Angles between which it begins to fall below the hairline
+    end: float = 0.0  # Height at which falling hair ends
     over_ears: float = 0.0
-    knot: float = 0.0
+    knot: float = 0.0  # At the back of the head
 
 
 _CUTS: dict[HairStyle, _Cut] = {

@@ -14,12 +14,10 @@ from facediff.synthetic.head.layout import Index
 
 @dataclass(frozen=True)
 class QuadMesh:
-    """A symmetric mesh of quads with named vertices.
+    """A symmetric mesh of quads with named vertices (V, 3) in mm and their colours.
 
     Attributes:
-        vertices: positions in mm, (V, 3).
         quads: vertices of each face, counter-clockwise seen from outside, (Q, 4); a triangle repeats its last vertex.
-        colours: red, green and blue of each vertex from 0 to 255, (V, 3).
         mirror: the vertex on the other side, (V,); on the midline the vertex itself.
         groups: vertices of the left half by name, in the order in which they were made.
     """

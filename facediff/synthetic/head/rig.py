@@ -1,4 +1,4 @@
-"""The rig of the head: ARKit's 52 shapes by name, two of the tongue, and a neck that turns it.
+"""The rig of the head: ARKit's 52 shapes by name, and two of the tongue.
 
 Every shape is a table of displacements, so that a pose is the neutral head plus a weighted sum of them, and weights and
 vertices are two ways to write one motion. Lengths are in mm.
@@ -32,8 +32,6 @@ SHAPES = (*ALPHABETICAL, *TONGUE)
 JAW_DEGREES = 21.0  # Turn of the lower jaw at weight 1
 HINGE = (0.0, 14.0)  # Height and depth of its axis, in front of the ears
 LOOK_SIDEWAYS, LOOK_UP, LOOK_DOWN = 30.0, 25.0, 30.0  # Degrees by which an eyeball turns at weight 1
-NECK = np.array([0.0, -95.0, -20.0])
-"""The joint about which the head turns."""
 UPPER_SHARE = 0.3
 """Part of the way to meeting lips that the upper one goes (0.2 to 0.4 in people, Löfqvist and Gracco, 1997)."""
 _MEET = 0.16
@@ -221,8 +219,7 @@ class _Fields:
     def _lids(self) -> dict[str, Array]:
         """Blink, wide and squint: edges of the lids slide over the eyeball, the skin round them follows less and less.
 
-        The eyes' turns are here too, since the lids go along with them: the upper one covers the iris' upper rim
-        wherever it looks.
+        The eyes' turns are here too: the upper lid covers the iris' upper rim wherever it looks.
         """
         blink, wide, squint = (np.zeros((len(self.x), 3)) for _ in range(3))
         half = EYE_POINTS // 2
@@ -334,22 +331,3 @@ def _outside_ball(points: Array, radius: float) -> Array:
 def _round_the_eye(upper: Array, lower: Array) -> Array:
     """Moves of a loop round the eye (24, 3) from its upper and its lower half, both (13, 3) with corners."""
     return np.concatenate([upper, lower[-2:0:-1]])
-
-
-def turned(vertices: Array, angles: Array, neck: Array = NECK) -> Array:
-    """Motion (T, V, 3) with the head turned about the neck.
-
-    Args:
-        vertices: motion of a head that is held still.
-        angles: pitch (chin down), yaw (to its left) and roll (towards its left shoulder) of each frame in degrees,
-            (T, 3).
-        neck: the joint, in the vertices' unit.
-    """
-    pitch, yaw, roll = np.deg2rad(angles).T
-    turns = np.zeros((len(angles), 3, 3))
-    for angle, (first, second) in ((roll, (0, 1)), (pitch, (2, 1)), (yaw, (0, 2))):
-        turn = np.tile(np.eye(3), (len(angles), 1, 1))
-        turn[:, first, first] = turn[:, second, second] = np.cos(angle)
-        turn[:, first, second], turn[:, second, first] = np.sin(angle), -np.sin(angle)
-        turns = turn if not turns.any() else turn @ turns
-    return np.asarray((vertices - neck) @ turns.transpose(0, 2, 1) + neck)
