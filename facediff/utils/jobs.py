@@ -8,15 +8,14 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from facediff.errors import FaceDiffError, MissingExtraError
 from facediff.utils.progress import progress_bar
-from facediff.utils.workers import LOCAL, Mode, WorkerDied, processors, run_locally
+from facediff.utils.workers import LOCAL, Mode, processors, run_locally
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -135,22 +134,3 @@ def run_tasks(
         for pair in results:
             yield pair
             step()
-
-
-def in_order(
-    results: Iterable[tuple[Task, Result | WorkerDied]], tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Result]]:
-    """Results in the order of the tasks, for sums with a last digit that depends on it; tasks are hashable.
-
-    Example:
-        >>> list(in_order([("b", 2), ("a", 1)], ["a", "b"]))
-        [('a', 1), ('b', 2)]
-    """
-    early: dict[Task, Result] = {}
-    queue = deque(tasks)
-    for task, result in results:
-        if isinstance(result, WorkerDied):
-            raise FaceDiffError(f"{task}: killed its process, perhaps for lack of memory; use fewer --workers")
-        early[task] = result
-        while queue and queue[0] in early:
-            yield queue[0], early.pop(queue.popleft())
