@@ -184,13 +184,9 @@ def report(error: BaseException) -> int:
     out_of_memory = ("out of memory" in text, "allocate memory" in text, "Unable to allocate" in text)
     if isinstance(error, MemoryError) or any(out_of_memory):
         return fail(f"there is not enough memory ({text or 'none left'}); use shorter inputs or --workers 1 ({more})")
-    if isinstance(error, RecursionError):
-        return fail(f"an input is nested too deeply; expected plain data ({more})")
     if isinstance(error, OSError):
         name = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
-    if isinstance(error, UnicodeError):
-        return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
     if isinstance(error, RuntimeError) and LOST_PROCESS.search(text):
         return fail(
             f"another process of the run ended, or cannot be reached: {text[:100]}; see its own message, or whether "

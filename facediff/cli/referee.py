@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from facediff.pipelines.candidates import Candidate
     from facediff.synthetic.spoken_set import SpokenClip
 
-PLANS = (".yaml", ".yml")
 FRAME_RATE = 25.0  # of the reference
 
 
@@ -39,8 +38,8 @@ def referee(
 ) -> int:
     """Compare models on one face and the same speech with known phonemes.
 
-    MODEL is NAME=PATH or PATH of a checkpoint, a model folder, an exported folder or a folder of Audio2Face-3D, or a
-    plan (.yaml) of them; puppet, or none, is the model that comes with facediff. Closures, timing, jitter, blinks,
+    MODEL is NAME=PATH or PATH of a checkpoint, a model folder, an exported folder or a folder of Audio2Face-3D;
+    puppet, or none, is the model that comes with facediff. Closures, timing, jitter, blinks,
     head, languages, cost and licence are reported.
     Exit status: 0 all scored, 1 some models could not be scored, 2 something to put right.
 
@@ -117,7 +116,7 @@ def judged(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None
 def candidates_of(
     models: Sequence[str], motion: Sequence[str], layout: str | None, frame_rate: float | None
 ) -> list[Candidate]:
-    """The models to compare, from the command line and from plans."""
+    """The models to compare."""
     from facediff.pipelines.candidates import Candidate
 
     candidates: list[Candidate] = []
@@ -126,9 +125,6 @@ def candidates_of(
         if not equals or Path(word).exists():
             name, path = Path(word).stem if Path(word).suffix == ".ckpt" else Path(word).name, word
         path = str(model_or_bundled(Path(path)))
-        if Path(path).suffix in PLANS:
-            candidates += read_models(Path(path))
-            continue
         check_animating_source(path)
         candidates.append(Candidate(name, path))
     for name, folder in named_folders(motion).items():
@@ -139,27 +135,4 @@ def candidates_of(
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
         raise FaceDiffError(f"{repeated}: is the name of two models; name them with NAME=PATH")
-    return candidates
-
-
-def read_models(path: Path) -> list[Candidate]:
-    """The models of a plan: names with paths, or with the fields of a candidate."""
-    from facediff.pipelines.candidates import Candidate
-    from facediff.utils.records import read_record
-    from facediff.utils.yaml_files import load_yaml
-
-    expected = "expected models: with a name and a path each"
-    models = load_yaml(path, expected).get("models")
-    candidates = []
-    for name, value in models.items() if isinstance(models, dict) else ():
-        content = value if isinstance(value, dict) else {"model": value}
-        entry = f"{path}: models.{name}"
-        candidate = read_record(Candidate, {**content, "name": name}, entry)
-        if (candidate.model is None) == (candidate.motion is None):
-            raise FaceDiffError(f"{entry}: expected either a model or a folder of motion")
-        if candidate.model is not None:
-            check_animating_source(candidate.model)
-        candidates.append(candidate)
-    if not candidates:
-        raise FaceDiffError(f"{path}: names no model; {expected}")
     return candidates

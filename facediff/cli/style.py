@@ -8,7 +8,6 @@ from typing import Annotated
 from facediff.animation.options import LicenceOptions
 from facediff.cli.options import Checkpoint, Identity
 from facediff.cli.process import tell
-from facediff.errors import FaceDiffError
 from facediff.utils.hub import check_model_source, split_face
 from facediff.utils.option import Option
 
@@ -34,16 +33,14 @@ def extract(
 
     from facediff.animation.styles import marked
     from facediff.models import ManyFaces, load_model
-    from facediff.models.styles import extract_style, still_style
+    from facediff.models.styles import still_style
+    from facediff.pipelines.animator import Animator
     from facediff.utils.files import atomic
 
     model = load_model(checkpoint, commercial_only=licence.commercial_only)
-    vector = extract_style(clips, identity or model.identities[0], model)
-    if not len(vector):
-        raise FaceDiffError(f"{checkpoint}: was trained without a dynamic style, so it has no style vectors")
     import numpy as np
 
-    numbers = vector.numpy()
+    vector = numbers = Animator(model, checkpoint).extract_style(clips, identity=identity)
     # Faces of one model take each other's styles, but each has its own encoder of meshes: they answer differently.
     if not isinstance(model, ManyFaces) and split_face(checkpoint)[1] is None:
         numbers = marked(numbers, still_style(model).numpy())

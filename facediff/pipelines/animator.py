@@ -315,27 +315,14 @@ class Animator:
     @overload
     def animate(
         self,
-        speech: Speech,
+        speech: Speech | list[Any],
         rate: float | None = None,
         *,
-        samples: int,
         name: str | None = None,
         progress: bool | Progress = False,
         dtype: DType | None = None,
-        **options: Unpack[RecordingKeywords],
-    ) -> Animation | Samples: ...
-
-    @overload
-    def animate(
-        self,
-        speech: list[Any],
-        rate: float | None = None,
-        *,
-        name: None = None,
-        progress: bool | Progress = False,
-        dtype: DType | None = None,
         **options: Unpack[AnimateKeywords],
-    ) -> list[Animation | Samples]: ...
+    ) -> Any: ...  # noqa: ANN401 - Samples where there are several, lists of several recordings
 
     @with_options(AnimationOptions, AnimateKeywords)
     def animate(

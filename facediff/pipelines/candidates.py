@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -51,10 +51,6 @@ class Candidate:
         motion: folder of files that are called as the clips are; None for a model.
         layout: of parameters in these files that do not say it; see :func:`facediff.spaces.layouts.layout`.
         frame_rate: frames a second of these files, where they do not say it.
-        identity: the animated face; the speaker of the open face where the model has it, if None.
-        style: as ``facediff animate`` takes it.
-        licence: of a model that ran elsewhere.
-        commercial_use: allowed, forbidden or unknown; of such a model.
     """
 
     name: str
@@ -62,10 +58,6 @@ class Candidate:
     motion: Path | None = None
     layout: str | None = None
     frame_rate: ranges.FrameRate | None = None
-    identity: str | None = None
-    style: str | None = None
-    licence: str = ""
-    commercial_use: Literal["allowed", "forbidden", "unknown"] = "unknown"
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,10 +195,7 @@ def _animate(candidate: Candidate, clips: Sequence[SpokenClip], placement: Place
 
     animator = load(candidate.model, device="cpu")
     faces = [*animator.identities, *animator.other_identities]
-    identity = candidate.identity or (SPEAKER if SPEAKER in faces else None)
-    options: RecordingKeywords = {} if identity is None else {"identity": identity}
-    if candidate.style is not None:
-        options["style"] = candidate.style
+    options: RecordingKeywords = {"identity": SPEAKER} if SPEAKER in faces else {}
     motions: dict[str, SpokenMotion] = {}
     # The first call loads libraries, so it is not counted.
     animator.animate(clips[0].samples, SAMPLE_RATE, name="first", **options)
@@ -265,8 +254,8 @@ def _read(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placemen
         frame_rate or 25.0,
         placement.jaw,
         placement.way,
-        candidate.licence or "unknown",
-        candidate.commercial_use,
+        "unknown",
+        "unknown",
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from facediff.cli.app import main
-from facediff.cli.referee import candidates_of, read_models
+from facediff.cli.referee import candidates_of
 from facediff.errors import FaceDiffError
 
 
@@ -36,30 +36,8 @@ def test_speech_is_written_for_other_programs(tmp_path: Path) -> None:
     assert len(list((tmp_path / "speech" / "wav").glob("*.wav"))) == 2
 
 
-def test_a_plan_names_models_and_motion(tmp_path: Path) -> None:
+def test_names_of_models_are_different(tmp_path: Path) -> None:
     (tmp_path / "a.ckpt").touch()
-    (tmp_path / "motion").mkdir()
-    plan = tmp_path / "models.yaml"
-    plan.write_text(
-        f"models:\n  first: {tmp_path / 'a.ckpt'}\n  second: {{motion: {tmp_path / 'motion'}, layout: arkit, "
-        f"frame_rate: 29.97, licence: theirs, commercial_use: forbidden}}\n"
-    )
-    first, second = read_models(plan)
-    assert first.model == str(tmp_path / "a.ckpt")
-    assert second.frame_rate == 29.97
-    assert second.commercial_use == "forbidden"
-    assert second.motion == tmp_path / "motion"
-    assert [candidate.name for candidate in candidates_of([str(plan)], [], None, None)] == ["first", "second"]
     assert candidates_of(["puppet"], [], None, None) == candidates_of([], [], None, None)
-    with pytest.raises(FaceDiffError, match="first"):
-        candidates_of([str(plan), f"first={tmp_path / 'a.ckpt'}"], [], None, None)
-    for wrong in ("models: [a.ckpt, b.ckpt]\n", f"models: {{one: {{motion: {tmp_path}, frame_rate: 0}}}}\n"):
-        plan.write_text(wrong)
-        with pytest.raises(FaceDiffError, match="models.*; expected"):
-            read_models(plan)
-    plan.write_text("models: {one: {layout: arkit}}\n")
-    with pytest.raises(FaceDiffError, match=r"models\.one"):
-        read_models(plan)
-    plan.write_text("models: {}\n")
-    with pytest.raises(FaceDiffError, match="names no model"):
-        read_models(plan)
+    with pytest.raises(FaceDiffError, match="name of two models"):
+        candidates_of([f"one={tmp_path / 'a.ckpt'}", f"one={tmp_path / 'a.ckpt'}"], [], None, None)
