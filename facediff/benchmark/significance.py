@@ -75,13 +75,7 @@ class Difference:
 
 
 def difference(one: RowScores, baseline: RowScores, bootstrap: Bootstrap) -> Difference:
-    """Compare two rows by one score.
-
-    Args:
-        one: the row.
-        baseline: the row that is subtracted.
-        bootstrap: resamples, level and seed; the permutations have the same seed.
-    """
+    """Compare two rows by one score; the permutations have the bootstrap's seed."""
     p_runs, runs = welch(one, baseline, bootstrap.level)
     tables = in_both(one, baseline)
     if tables is None:
@@ -114,13 +108,8 @@ def both_chances(gaps: Array, runs: Sequence[Array], level: float = 0.95) -> tup
 
     The common part of a run and a sentence is in both variances, so the test errs on the safe side.
 
-    Args:
-        gaps: contributions of sentences to the difference (sentences,).
-        runs: the score of each training run (runs,), for each of the rows that were trained.
-        level: of the interval.
-
-    Returns:
-        p-value and interval; None with a single sentence, or where a row that was trained has a single run.
+    ``gaps`` are the contributions of sentences to the difference (sentences,), ``runs`` the score of each training run
+    (runs,), for each of the rows that were trained. None with a single sentence, or where such a row has a single run.
     """
     from scipy.stats import t as student
 
@@ -181,12 +170,7 @@ def follows_speech(scores: RowScores, shuffled: RowScores, sign: int, bootstrap:
     """Whether a method's score is significantly better with the sentence's speech than with another sentence's.
 
     Both are of the same training runs, so that runs are paired. With one run alone, sentences decide.
-
-    Args:
-        scores: with the sentences' own speech.
-        shuffled: of the same runs with other sentences' speech.
-        sign: 1 where lower is better, −1 where higher is.
-        bootstrap: its level decides, its seed is the permutations'.
+    ``sign`` is 1 where lower is better, −1 where higher is.
     """
     gap = sign * (shuffled.mean - scores.mean)
     tables = in_both(scores, shuffled)
@@ -201,10 +185,7 @@ def follows_speech(scores: RowScores, shuffled: RowScores, sign: int, bootstrap:
 def marked(rows: Mapping[str, RowScores], better: str | None, bootstrap: Bootstrap) -> dict[str, str]:
     """Which rows are ``best`` and ``second``, each only where its difference from every row behind it is significant.
 
-    Args:
-        rows: scores by row, without the reference rows.
-        better: ``lower`` or ``higher``; with another value nothing is marked, since no direction is the better one.
-        bootstrap: its level is also the level of significance.
+    Without a direction that is the better one (``lower``, ``higher``) nothing is marked.
     """
     if better not in ("lower", "higher") or len(rows) < 2:
         return {}

@@ -168,11 +168,8 @@ def index_truths(names: Mapping[Path, Name]) -> dict[str, Truth]:
 def pair_up(predictions: Mapping[Path, Name], truths: Mapping[str, Truth], identity: str) -> tuple[list[Pair], Missing]:
     """Find each truth's predictions: pairs sorted by clip, and the files and clips without a counterpart.
 
-    Args:
-        predictions: a method's files with the fields of their names.
-        truths: truths by clip.
-        identity: ``own``: the prediction conditioned on the speaker's own identity, or else the one without a condition
-            in its name; ``all``: every condition; or a condition's name.
+    ``identity`` is ``own``, the prediction conditioned on the speaker's own identity or else the one without a
+    condition in its name; ``all``, every condition; or a condition's name.
     """
     pairs, unscored = list[Pair](), Missing()
     by_clip: dict[str, dict[str, Path]] = {}
@@ -271,14 +268,7 @@ PAIR_FILES: dict[type[LipPairs], tuple[str, str, str]] = {
 
 
 def read_pairs(source: str | None, corpus: Path | None, n_vertices: int, kind: type[LipPairs] = LipPairs) -> LipPairs:
-    """Pairs of an upper and a lower lip or eyelid vertex.
-
-    Args:
-        source: a text file of pairs, or the pairs themselves, ``3531-3504,1-2``; the corpus's file if None.
-        corpus: the corpus folder.
-        n_vertices: vertices of the mesh.
-        kind: of the lips or of the eyelids.
-    """
+    """Pairs of an upper and a lower lip or eyelid vertex: of a file, as in ``3531-3504,1-2``, or the corpus's."""
     file, option, part = PAIR_FILES[kind]
     if source is None and corpus is not None and (corpus / file).is_file():
         source = str(corpus / file)

@@ -14,10 +14,7 @@ from facediff.errors import FaceDiffError, choices
 def attributes_of(corpus: Path | None, names: Collection[str], by: Sequence[str]) -> dict[str, dict[str, str]]:
     """The attributes ``by`` of each clip, empty where it has none.
 
-    Args:
-        corpus: the corpus folder; its ``clips.csv`` is read if there is one.
-        names: of the clips' files, without suffix; those of some corpora hold attributes.
-        by: which attributes.
+    They are read from the corpus's ``clips.csv``, else from the clips' names, which hold them in some corpora.
     """
     table = {} if corpus is None else read_clip_table(corpus)
     by_clip = {name: table[name] if name in table else attributes_of_name(name) for name in names}

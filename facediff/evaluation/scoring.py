@@ -91,12 +91,8 @@ class Scorer:
     May be used by several threads at the same time.
 
     Args:
-        protocols: of the scores.
-        lips: lip vertices.
         upper_face: upper-face vertices; None if no protocol has FDD.
         templates: neutral face (V, 3) by identity; empty if no protocol has FDD.
-        n_vertices: vertices of the mesh.
-        truth_stride: 2 takes every second frame of the truth, and so on.
         metrics: further metrics by name, made for the corpus.
         inputs: gives their inputs of a clip besides its motion.
         moments: in which frames a metric of that name is taken.

@@ -127,15 +127,7 @@ def sign_flip(differences: Array, *, seed: int = 0) -> float:
 
 
 def wilson_interval(wins: float, count: float, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's (1927) score interval of a share.
-
-    Args:
-        wins: how often it happened; half for no difference.
-        count: out of how many.
-        level: of the interval.
-
-    Returns:
-        lower and upper end; 0 and 1 if nothing was counted.
+    """Wilson's (1927) score interval of the share ``wins / count``; 0 and 1 if nothing was counted.
 
     Example:
         >>> [round(end, 4) for end in wilson_interval(89, 120)]
@@ -173,13 +165,7 @@ def share_between_raters(
     """Percentile interval of a share over raters that are drawn again with replacement.
 
     Unlike intervals of single answers, it accounts for the similarity of one rater's answers.
-
-    Args:
-        wins: of each rater (R,).
-        counts: answers of each rater (R,).
-        level: of the interval.
-        resamples: how often raters are drawn.
-        seed: of the draws.
+    Wins and answers are of each rater (R,).
     """
     if not counts.sum():
         return 0.0, 1.0

@@ -189,17 +189,7 @@ def analyse(
     seed: ranges.Seed = 0,
     notes: Sequence[str] = (),
 ) -> StudyReport:
-    """Analyse the answers to a study.
-
-    Args:
-        study: its definition.
-        raters: all raters.
-        name: of the data set, for tables.
-        level: of all intervals.
-        resamples: for intervals between raters.
-        seed: of the resamples.
-        notes: on files that were set aside.
-    """
+    """Analyse the answers to a study."""
     checks = tuple(check_rater(rater, study) for rater in raters)
     included = [rater for rater, check in zip(raters, checks, strict=True) if not check.reasons]
     preferences: list[Preference] = []
@@ -257,12 +247,7 @@ def analyse_folder(
 ) -> StudyReport:
     """Analyse the study of a folder: answers of its server, and files that raters have downloaded.
 
-    Args:
-        folder: the study's folder.
-        files: downloaded files, and folders of them.
-        name: of the data set, for tables; the folder's name if None.
-        ignored: ids of other studies, the files of which are passed over.
-        options: of :func:`analyse`.
+    Files of studies with ``ignored`` ids are passed over; ``name`` is the data set's in tables, else the folder's.
     """
     study = read_study(folder)
     raters, notes = gather_raters(folder, study, files, ignored)

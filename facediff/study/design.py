@@ -66,16 +66,10 @@ def make_forms(
     repeats: int,
     seed: int,
 ) -> list[list[Showing]]:
-    """The forms, each with its controls.
+    """The forms, in the design ``latin`` one pair of every clip, or ``all``; each with its controls.
 
-    Args:
-        clips: names of the clips.
-        pairs: the comparisons.
-        design: ``latin``, one pair of every clip in a form, or ``all``, every pair of every clip.
-        still: controls of the truth against a still face in every form.
-        same: controls of one animation on both sides.
-        repeats: pairs that come a second time, with their sides exchanged.
-        seed: of the controls' clips.
+    ``still`` of them are the truth against a still face, ``same`` one animation on both sides, and ``repeats`` are
+    pairs that come a second time, with their sides exchanged.
 
     Example:
         >>> forms = make_forms(["a", "b"], [("ours", "theirs")], design="latin", still=0, same=0, repeats=0, seed=0)

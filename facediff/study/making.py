@@ -104,13 +104,8 @@ class StudyPlan:
     ) -> int:
         """Draw the videos and write the page and the key; the number of videos that were drawn.
 
-        Videos of an earlier run with the same files and options are kept.
-
-        Args:
-            output: the study's folder.
-            workers: videos at a time; as many as processors, or workers of a cluster, if None.
-            scheduler: where they are drawn; see :func:`facediff.utils.jobs.run_tasks`.
-            progress: whether a progress bar is shown.
+        Videos of an earlier run with the same files and options are kept; ``workers`` and ``scheduler`` are as for
+        :func:`facediff.utils.jobs.run_tasks`.
         """
         check_output(output, self.study)
         folder = output / PAGE_FOLDER / VIDEO_FOLDER
@@ -180,12 +175,8 @@ def plan_study(
 ) -> StudyPlan:
     """Choose clips, trials and schedules, after reading and checking every file.
 
-    Args:
-        methods: each method's folder; the first is compared with the others and with the truth.
-        options: how the study is made.
-        truth: a corpus folder, a folder of animations, or ``puppet``; None for a study without truth.
-        sources: further arguments of :class:`StudyAnimations`: ``references``, ``identity``, ``speech``, ``mesh``,
-            ``frame_rate`` and ``unit``.
+    The first method is compared with the others and with the truth; ``sources`` are further arguments of
+    :class:`StudyAnimations`.
     """
     options = options or StudyOptions()
     if len(methods) + (truth is not None) < 2:

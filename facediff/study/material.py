@@ -85,18 +85,13 @@ class StudyAnimations:
     """The files of a study.
 
     Args:
-        methods: each method's folder.
         truth: a corpus folder, a folder of animations, or ``puppet``; None for a study without truth.
         references: folder of animations whose speakers' names begin the names of its files; the truth's other clips if
             None.
         identity: the style of the predictions: ``own``, or an identity's name.
         speech: folder of recordings; the corpus's, or those that the animations hold, if None.
-        mesh: a file with the triangles of bare arrays.
-        frame_rate: frames a second of bare arrays.
-        unit: unit of length of bare arrays.
 
     Attributes:
-        methods: names of the methods.
         remark: stands below every video, such as that the corpus is synthetic.
     """
 

@@ -137,13 +137,8 @@ def serve(
 ) -> AnswerStore:
     """Serve a study until Ctrl-C; the store of its answers.
 
-    Args:
-        folder: the study's folder; answers go into ``answers.sqlite`` there.
-        host: address to listen at; by default only this machine reaches it.
-        port: to listen at; 0 for any free one.
-        name: host name of a web server in front; requests under other names are refused.
-        most_raters: raters that the study takes; no limit if None.
-        ready: called with the page's address as soon as it can be opened.
+    ``name`` is the host name of a web server in front: requests under other names are refused. ``ready`` is called with
+    the page's address as soon as it can be opened.
     """
     require_server("serving a study")
     study = check_folder(folder)

@@ -45,9 +45,6 @@ class AnswerStore:
     written to disk before a call returns; a writer waits for another one.
 
     Args:
-        path: the file; it is made if it is not there.
-        study: that the answers belong to.
-        most_raters: of all.
         read_only: whether nothing is written, not even an empty file.
     """
 

@@ -84,13 +84,8 @@ class Questionnaire:
     Args:
         path: a YAML file with ``questions``, ``title``, ``consent`` and ``rule``, each of which may be missing; None
             for the paper's questions and a field for comments.
-        languages: of the page.
 
     Attributes:
-        questions: in order.
-        title: of the page.
-        consent: of the raters.
-        rule: of exclusion.
         named: whether the file names the questions, so that none may be left out for lack of references.
     """
 

@@ -98,14 +98,7 @@ def draw_frames(
 ) -> None:
     """Draw truth and methods, a row each, at chosen moments, a column each.
 
-    Args:
-        material: of the evaluation.
-        clip: ``<subject>_<sentence>``.
-        moments: the columns.
-        output: ``.png``, ``.pdf`` or ``.svg``.
-        paper: width, resolution and font.
-        view: a name in :data:`facediff.render.VIEWS`.
-        region: vertices to show in a close-up, such as the lips; the whole face if None.
+    ``view`` is a name in :data:`facediff.render.VIEWS`; ``region`` has the vertices of a close-up, such as the lips.
     """
     check_output(output)
     paper = paper or Paper()

@@ -43,18 +43,8 @@ def gather(
 ) -> FigureData:
     """Find truth, methods and their mesh; where an option is None, the corpus says it.
 
-    Args:
-        methods: each method's folder of predictions.
-        truth: a corpus folder, any folder of .npy files, or ``puppet``, the built-in corpus in the user's cache folder.
-        patterns: how predictions are named.
-        truth_pattern: how truths are named.
-        identity: the style of the predictions.
-        topology: the corpus that the mesh belongs to.
-        templates: file of each speaker's neutral face.
-        mesh: file with the faces.
-        frame_rate: frames a second of the predictions.
-        truth_stride: use every n-th frame of the truth; by the frame rates if None.
-        unit: unit of the vertices.
+    ``truth`` is a corpus folder, any folder of .npy files, or ``puppet``, the built-in corpus in the user's cache
+    folder, of which every ``truth_stride``-th frame is used; ``identity`` is the style of the predictions.
     """
     if truth == Path("puppet") and not truth.is_dir():
         built_in = made_root(0)

@@ -73,16 +73,8 @@ def draw_heatmap(
 ) -> list[str]:
     """Draw mean and standard deviation over time of each vertex's distance from the template, truth and methods.
 
-    Args:
-        material: of the evaluation.
-        clips: names of clips.
-        output: ``.png``, ``.pdf`` or ``.svg``.
-        paper: width, resolution and font.
-        view: a name in :data:`facediff.render.VIEWS`.
-        highest: ends of the colour scales of mean and deviation, in the unit shown; the largest value if None.
-
-    Returns:
-        notes on omissions.
+    ``view`` is a name in :data:`facediff.render.VIEWS`; ``highest`` has the ends of the colour scales of mean and
+    deviation, in the unit shown, where they are not the largest values. The result is notes on omissions.
     """
     from facediff.render.panels import heat_colours
 

@@ -101,14 +101,7 @@ def draw_lips(
 ) -> None:
     """Draw the opening of the mouth of truth and methods, with phonemes and waveform beneath.
 
-    Args:
-        curves: the openings.
-        sound: speech and phonemes.
-        output: ``.png``, ``.pdf`` or ``.svg``.
-        paper: width, resolution and font.
-        scale: factor of the openings, and the resulting unit.
-        span: first and last second; the whole clip if None.
-        remark: small text below everything.
+    ``scale`` has the factor of the openings and the resulting unit, ``span`` the first and the last second.
     """
     check_output(output)
     paper = paper or Paper()

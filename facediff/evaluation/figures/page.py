@@ -194,13 +194,9 @@ class Grid:
     """A figure of pictures of one size, laid out in mm: row names upright at the left, headings above the columns.
 
     Args:
-        paper: width, resolution and font.
-        rows: name of each row.
-        columns: heading of each column.
         aspect: width of a picture by its height.
         highest: largest height of a picture in mm.
         right: mm that stay free at the right, for colour bars.
-        remark: small text below everything.
     """
 
     def __init__(
