@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -108,11 +108,11 @@ class DirectedStream:
 
     def feed(self, samples: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Take more speech (n,) at 16 kHz, and give the vertices (seeds, m, V, 3) that have become certain."""
-        return self._blended(SpeechStream.feed, samples)
+        return self._blended(lambda stream: stream.feed(samples))
 
     def finish(self, frames: int | None = None) -> npt.NDArray[np.float32]:
         """Give the vertices that are left; of so many frames in all, if they are given."""
-        return self._blended(SpeechStream.finish, frames)
+        return self._blended(lambda stream: stream.finish(frames))
 
     def parts(
         self, speech: npt.NDArray[np.float32], *, progress: Progress | None = None
@@ -120,10 +120,10 @@ class DirectedStream:
         """All vertices for a recording, part by part."""
         return in_parts(self, speech, progress=progress)
 
-    def _blended(self, step: Callable[[SpeechStream, Any], Tensor], argument: Any) -> npt.NDArray[np.float32]:  # noqa: ANN401
+    def _blended(self, step: Callable[[SpeechStream], Tensor]) -> npt.NDArray[np.float32]:
         with self._precision(), self.model.choosing(self._choices):
             # Absolute vertices are blended, as they are in one pass: the two agree to the last bit.
-            motions = [step(stream, argument).cpu() + self._template for stream in self.streams]
+            motions = [step(stream).cpu() + self._template for stream in self.streams]
         vertices = blend(motions, self.runs, self.model.frame_rate, self.frames)
         self.frames += vertices.shape[1]
         array: npt.NDArray[np.float32] = vertices.numpy()

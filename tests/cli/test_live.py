@@ -53,7 +53,7 @@ def test_live_frames_are_those_of_a_stream(
     assert [frame["time"] for frame in frames] == pytest.approx([each / head["frame_rate"] for each in index])
 
 
-@pytest.mark.parametrize("method", ["ARTalk", "DiffPoseTalk", "facediff's windows"])
+@pytest.mark.parametrize("method", ["ARTalk", "facediff's windows"])
 def test_live_knows_how_late_a_models_own_windows_are(method: str, tmp_path: Path) -> None:
     path, plan = tmp_path / "tiny.ckpt", {"window": 0.8} if method == "facediff's windows" else {}
     if method == "ARTalk":
