@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.data.manifest import LONGEST
+from facediff.data.manifest import LONGEST, refuse_interrupted
 from facediff.data.manifest import read_manifest as read_manifest
 from facediff.data.recordings import RecordingFolder
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
@@ -173,11 +173,7 @@ class Corpus:
         self._frames: dict[str, int] = {}
 
     def _stride(self, root: Path, default: float) -> int:
-        if (root / "prepare.json").is_file() and not (root / "manifest.json").is_file():
-            raise FaceDiffError(
-                f"{root}: its preparation was interrupted (prepare.json is there, manifest.json is not); run the same "
-                f"`facediff data prepare` again to continue it"
-            )
+        refuse_interrupted(root)
         stored = float(read_manifest(root).get("frame_rate") or default)
         stride = round(stored / self.frame_rate)
         if stride < 1 or abs(stride * self.frame_rate - stored) > 1e-6:

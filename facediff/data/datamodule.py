@@ -216,10 +216,6 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         self.augmenter: Augmenter | None = None
         if augmentations:
             self.augmenter = Augmenter(read_augmentations(augmentations), augmented_share)
-        elif augmented_clips:
-            raise ArgumentError(
-                {"augmented_clips": augmented_clips}, "changes nothing without augmentations; name some"
-            )
         self.augmented_clips = augmented_clips or {}
         self.people = [Path(folder).expanduser() for folder in people or []]
         files = {"lips": lips, "upper_face": upper_face, "face": face}
@@ -702,12 +698,12 @@ def further_corpus(name: str, options: dict[str, Any]) -> SpeechMotionDataModule
     module = find_class(corpora, path, SpeechMotionDataModule)
     arguments = {key: value for key, value in options.items() if key != "corpus"}
     unknown = arguments.keys() - (options_of(module) if module is not None else {})
-    if not is_name(name) or "." in name or hasattr(torch.nn.ModuleDict(), name):
-        raise ArgumentError({"further_corpora": name}, "is no name that a part of a model can have; choose another")
-    if module is None or "further_corpora" in options or unknown:
+    named = is_name(name) and "." not in name and not hasattr(torch.nn.ModuleDict(), name)
+    if not named or module is None or "further_corpora" in options or unknown:
         raise ArgumentError(
             {f"further_corpora.{name}": options},
-            f"expected options of a data module with corpus=NAME, one of {', '.join(corpora.names())}",
+            f"expected a name that a part of a model can have, and options of a data module with corpus=NAME, one of "
+            f"{', '.join(corpora.names())}",
         )
     data: SpeechMotionDataModule = module(**arguments)
     return data

@@ -52,3 +52,12 @@ def read_manifest(root: Path) -> dict[str, Any]:
     manifest = load_manifest(path)
     read_record(Manifest, manifest, path, remedy=REMEDY, strict=False)
     return manifest
+
+
+def refuse_interrupted(root: Path) -> None:
+    """Refuse a folder that its preparation has not finished."""
+    if (root / "prepare.json").is_file() and not (root / "manifest.json").is_file():
+        raise FaceDiffError(
+            f"{root}: its preparation was interrupted (prepare.json is there, manifest.json is not); run the same "
+            f"`facediff data prepare` again to continue it"
+        )

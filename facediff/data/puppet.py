@@ -72,15 +72,9 @@ class PuppetChannels(ChannelFolder):
             open_array(self.root / folder / f"{name}.npy", kinds="f")
             for folder in (WEIGHTS_FOLDER, "gaze_npy", "head_npy")
         )
-        frames = len(weights)
-        if weights.shape != (frames, len(SHAPES)) or gaze.shape != (frames, 2) or head.shape != (frames, 3):
-            raise FaceDiffError(
-                f"{self.path_of(name)}: weights, gaze and head have the shapes {weights.shape}, {gaze.shape} and "
-                f"{head.shape}; expected equally many frames of {len(SHAPES)}, 2 and 3 numbers; make the corpus again"
-            )
         pitch, yaw, roll = np.deg2rad(np.asarray(head, np.float64)).T
         left, up = np.deg2rad(np.asarray(gaze, np.float64)).T
-        eye = (left, -up, np.zeros(frames))
+        eye = (left, -up, np.zeros_like(up))
         turns = np.stack([yaw, pitch, -roll, *eye, *eye], axis=1)
         return np.concatenate([weights, turns], axis=1).astype(np.float32)
 

@@ -175,15 +175,7 @@ def test_one_process_measures_and_the_others_receive(
 
 
 def test_what_goes_wrong_in_one_process_ends_all(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for path in (root / "vertices_npy").glob("*.npy"):
-        clip = np.load(path)
-        np.save(
-            path, np.repeat(Tiny(root=str(root)).corpus.templates[path.stem[0]].numpy().reshape(1, -1), len(clip), 0)
-        )
     sent: list[Any] = []
-    for rank in (0, 1):
-        with pytest.raises(FaceDiffError, match="no motion"):
-            of_rank(Tiny(root=str(root)), rank, sent).motion_scale()
     monkeypatch.setattr(Corpus, "read_spread", lambda *_: 1 / 0)  # a fault, and no error of facediff's own
     with pytest.raises(ZeroDivisionError):
         of_rank(Tiny(root=str(root)), 0, sent).motion_scale()

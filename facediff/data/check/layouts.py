@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args, get_origin, get_type_hints
 
 from facediff.data.check.findings import few
-from facediff.data.manifest import read_manifest
+from facediff.data.manifest import read_manifest, refuse_interrupted
 from facediff.data.storage import MOTION_FOLDERS, WEIGHTS_FOLDER, rig_path
 from facediff.errors import FaceDiffError, choices, lacking, number
 from facediff.utils.arrays import open_array, vertices_of
@@ -85,8 +85,7 @@ def identify(folder: CorpusFolder, manifest: dict[str, Any], corpus: str | None)
 
 def view_of(root: Path, corpus: str | None) -> CorpusView:
     """Recognise a corpus folder; see :func:`identify`."""
-    if (root / "prepare.json").is_file() and not (root / MANIFEST).is_file():
-        raise FaceDiffError(f"{root}: its preparation was interrupted; run the same `facediff data prepare` again")
+    refuse_interrupted(root)
     return identify(list_folder(root), read_manifest(root), corpus)
 
 

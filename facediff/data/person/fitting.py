@@ -100,20 +100,17 @@ def read_motion(path: Path, n_vertices: int, scratch: Path, flame: Path | None) 
     if flame is not None:
         parameters, layer = read_parameters(path), Flame.read(flame)
         template = np.asarray(layer.shaped(parameters.shape), np.float64)
-        if len(template) != n_vertices:
-            raise FaceDiffError(
-                f"{flame}: has {len(template)} vertices, but the corpus has {n_vertices}; so its topology is not FLAME"
-            )
-        frames = scratch_array(scratch, (len(parameters.expression), n_vertices, 3))
+        frames = scratch_array(scratch, (len(parameters.expression), *template.shape))
         for first in range(0, len(frames), FLAME_FRAMES):
             part = slice(first, first + FLAME_FRAMES)
             frames[part] = layer.vertices(parameters.shape, parameters.expression[part], parameters.jaw[part])
-        return FaceSequence(frames, template)
+        if len(template) == n_vertices:
+            return FaceSequence(frames, template)
     array = np.empty(0) if path.suffix.lower() in HDF5_SUFFIXES else open_array(path, kinds="f")
     if vertices_of(array.shape) != n_vertices:
         raise FaceDiffError(
             f"{path}: has shape {array.shape}; expected (frames, {n_vertices}, 3) or (frames, {3 * n_vertices}) like "
-            f"the corpus, or FLAME parameters with --flame MODEL"
+            f"the corpus, or FLAME parameters with --flame MODEL of as many vertices"
         )
     return FaceSequence(array.reshape(len(array), n_vertices, 3))
 
@@ -281,19 +278,17 @@ def choose_neutral(
 def _given(stabilised: StabilisedMotion, path: Path) -> NeutralFace:
     """A neutral face from .npy, and the rigid motion from the stabilised frames to it, by the stable vertices."""
     template = np.array(open_array(path, kinds="f"), np.float64).reshape(-1, 3)
-    if template.shape != stabilised.face.shape or not np.isfinite(template).all():
-        raise FaceDiffError(
-            f"{path}: has {len(template)} vertices, or NaN among them; expected {len(stabilised.face)} finite ones"
-        )
-    face, target = stabilised.face[stabilised.stable], template[stabilised.stable]
-    ratio = robust_align(face, target, scale=True).scale
-    rigid = robust_align(face, target)
-    residual = relative_residual(rigid.apply(stabilised.face), template)
+    ratio = residual = math.nan
+    if template.shape == stabilised.face.shape and np.isfinite(template).all():
+        face, target = stabilised.face[stabilised.stable], template[stabilised.stable]
+        ratio = robust_align(face, target, scale=True).scale
+        rigid = robust_align(face, target)
+        residual = relative_residual(rigid.apply(stabilised.face), template)
     if not abs(math.log(max(ratio, 1e-9))) < math.log(SAME_SIZE) or not residual < RESIDUAL_LIMIT:
         raise FaceDiffError(
-            f"{path}: is {ratio:.4g} times as large as the faces of the motion, and does not lie on them "
-            f"(residual {residual:.2f} of its size, expected less than {RESIDUAL_LIMIT}); expected the speaker's "
-            f"neutral face in the motion's own unit and vertex order"
+            f"{path}: has {len(template)} vertices, is {ratio:.4g} times as large as the faces of the motion, and does "
+            f"not lie on them (residual {residual:.2f} of its size, expected less than {RESIDUAL_LIMIT}); expected the "
+            f"speaker's neutral face in the motion's own unit and vertex order"
         )
     return NeutralFace(template, rigid, str(path))
 

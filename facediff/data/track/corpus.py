@@ -112,11 +112,9 @@ def find_videos(source: Path, name: str | None) -> dict[str, list[Path]]:
     else:
         folders = sorted(path for path in source.iterdir() if path.is_dir() and not path.name.startswith("."))
         direct = videos_in(source)
-        if direct and folders:
-            raise FaceDiffError(f"{source}: holds videos and folders; expected one person's videos, or a folder each")
         videos = {name or source.resolve().name: direct} if direct else {path.name: videos_in(path) for path in folders}
         refuse_idle(f"{source} has a folder for each person, whose names are theirs", name=bool(name and not direct))
-        videos = {person: files for person, files in videos.items() if files}
+        videos = {person: files for person, files in videos.items() if files and not (direct and folders)}
     for person in videos:
         if not NAME.fullmatch(person):
             raise FaceDiffError(
@@ -124,7 +122,10 @@ def find_videos(source: Path, name: str | None) -> dict[str, list[Path]]:
                 f"rename the folder"
             )
     if not videos:
-        raise FaceDiffError(f"{source}: holds no videos; expected {', '.join(VIDEOS)}")
+        raise FaceDiffError(
+            f"{source}: holds no videos ({', '.join(VIDEOS)}), or folders beside them; expected one person's videos, "
+            f"or a folder each"
+        )
     return videos
 
 

@@ -156,11 +156,6 @@ def summarise(recording: Recording, model: FaceModel, sample_size: int) -> Recor
         np.concatenate([getattr(block, name) for block in blocks]) for name in ("scales", "centres", "angles")
     )
     turned = np.nanmean(np.abs(angles[:, :2]).max(axis=1) > TURNED)
-    if turned > MOST_TURNED:
-        raise FaceDiffError(
-            f"{source}: the head is turned by more than {TURNED:g}° in {turned:.0%} of the frames; expected a face "
-            f"that looks towards the camera"
-        )
     still = np.concatenate([block.faces[:, STILL_POINTS] for block in blocks])
     frames = np.flatnonzero(np.isfinite(scales))
     steps = np.diff(frames)
@@ -175,10 +170,11 @@ def summarise(recording: Recording, model: FaceModel, sample_size: int) -> Recor
     starts = [0, *(np.flatnonzero(breaks) + 1)]
     parts = [(int(frames[a]), int(frames[b - 1]) + 1) for a, b in zip(starts, [*starts[1:], len(frames)], strict=True)]
     parts = [(a, b) for a, b in parts if recording.times[b - 1] - recording.times[a] >= MIN_SECONDS]
-    if not parts:
-        raise FaceDiffError(
-            f"{source}: has no {MIN_SECONDS:g} s of one face without a cut; expected a video of a person who speaks"
-        )
+    if not parts or turned > MOST_TURNED:
+        fault = f"has no {MIN_SECONDS:g} s of one face without a cut"
+        if turned > MOST_TURNED:
+            fault = f"the head is turned by more than {TURNED:g}° in {turned:.0%} of the frames"
+        raise FaceDiffError(f"{source}: {fault}; expected a person who speaks towards the camera")
     usable = np.concatenate([frames[(frames >= a) & (frames < b)] for a, b in parts])
     picks = usable[np.linspace(0, len(usable) - 1, min(sample_size, len(usable))).astype(int)]
     return RecordingSummary(parts, float(np.median(widths)), np.asarray(recording.landmarks[picks]))

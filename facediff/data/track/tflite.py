@@ -127,8 +127,6 @@ class Converter:
         for operation in self.graph.tables(3):
             code = self.codes[operation.number(0, "I")]
             inputs, result = operation.numbers(1).tolist(), operation.numbers(2).tolist()[0]
-            if code not in OPERATIONS:
-                raise ValueError(f"operation {code} of TensorFlow Lite, which is not supported")
             self.operation(OPERATIONS[code], inputs, result, operation.table(4))
         for number in outputs:
             self.node("Identity", [self.rows(number)], f"out{number}")

@@ -204,14 +204,6 @@ def test_sound_is_found_in_all_known_folders(tmp_path: Path) -> None:
     assert find_sounds(tmp_path / "video") == {}
 
 
-def test_several_processes_write_the_same(raw: Path, flame: Path) -> None:
-    one, _ = prepared(raw, flame)
-    two = raw.parent / "two"
-    assert not prepare(mead3d.plan(raw, flame=flame), two, workers=2, quiet=True).failed
-    for path in one.rglob("*.npy"):
-        assert (two / path.relative_to(one)).read_bytes() == path.read_bytes()
-
-
 def test_speakers_that_are_not_there_are_named(raw: Path, flame: Path) -> None:
     report = prepared(raw, flame)[1]
     absent = [key for key in report.missing if len(key) == 4]
