@@ -342,12 +342,14 @@ class FrontView:
 
     def _ways(self, opening: Opening, limit: float) -> tuple[Array, Array]:
         """Lengths (V,) of the ways along the surface to the upper and to the lower side; infinite beyond a limit."""
+        from scipy.spatial import cKDTree
+
         margin = limit + opening.width
         middle = opening.centre[:2]
         graph, rows_of = self.graph(self.within(middle - margin, middle + margin))
         ways = []
         for side, seeds in ((opening.upper, opening.upper_seeds), (opening.lower, opening.lower_seeds)):
-            way = _ways_from(graph, rows_of[seeds], _away(self.vertices[seeds], side), limit)
+            way = _ways_from(graph, rows_of[seeds], cKDTree(side).query(self.vertices[seeds])[0], limit)
             ways.append(np.where(rows_of >= 0, way[np.maximum(rows_of, 0)], np.inf))
         return ways[0], ways[1]
 
@@ -455,13 +457,6 @@ def _resampled(points: Array) -> Array:
     along = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-12))])
     at = np.linspace(0, along[-1], SAMPLES)
     return np.stack([np.interp(at, along, points[:, k]) for k in range(3)], 1)
-
-
-def _away(points: Array, curve: Array) -> Array:
-    """Distances (N,) of points to a curve's samples."""
-    from scipy.spatial import cKDTree
-
-    return np.asarray(cKDTree(curve).query(points)[0])
 
 
 def _ways_from(graph: csr_array, starts: Indices, offsets: Array, limit: float) -> Array:

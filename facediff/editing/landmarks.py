@@ -17,6 +17,7 @@ import numpy as np
 from facediff.editing.face_features import Features, Opening, find_features
 from facediff.errors import FaceDiffError, choices
 from facediff.synthetic.head.parts import N_HEAD_VERTICES, build_head
+from facediff.utils.hints import Range
 from facediff.utils.limits import check_format, quoted
 from facediff.utils.numerics import Array, Floats, Indices, Integers
 from facediff.utils.plain_files import load_json, read_table, write_json
@@ -278,6 +279,7 @@ def common_landmarks(source: Floats, target: Floats) -> Landmarks | None:
 
 FORMAT = "facediff landmarks 1"
 MOST, LONGEST_NAME = 1000, 60
+Vertex = Annotated[int, Range(0, 2**31 - 1)]
 VERTEX = re.compile("[0-9]{1,18}")  # fits into 64 bits
 EXAMPLE = "`source vertex,target vertex`, counted from 0, or a name of both such as `nose_tip,4034`"
 
@@ -291,8 +293,8 @@ def read_landmarks(
     """Pairs of places from a file: a CSV of two columns, or JSON as :func:`write_landmarks` writes it.
 
     Args:
-        path: CSV with or without a header, or .json. A name stands for the place of that name, as far as it is known
-            on the mesh; the other side may be a vertex or the same name.
+        path: CSV with or without a header, or .json. In a CSV, a name stands for the place of that name, as far as it
+            is known on the mesh; the other side may be a vertex or the same name.
         source: named places of the source; None for none.
         target: of the target.
         counts: vertices of both meshes, which a .json must have been picked on; None if they are not known.
@@ -301,7 +303,7 @@ def read_landmarks(
         content = load_json(
             path, remedy=f"expected landmarks, as `facediff retarget --pick` saves them, or CSV lines {EXAMPLE}"
         )
-        return parse_landmarks(content, path, source, target, counts)
+        return parse_landmarks(content, path, counts)
     names, pairs = [], []
     for number, line in enumerate(read_table(path, remedy="expected a CSV of vertex pairs"), 1):
         cells = [cell.strip() for cell in line if cell.strip()]
@@ -334,22 +336,8 @@ def _vertex_of(name: str, template: LandmarkTemplate | None, side: str, where: o
     return template.vertices[name]
 
 
-def parse_landmarks(
-    content: object,
-    where: object,
-    source: LandmarkTemplate | None = None,
-    target: LandmarkTemplate | None = None,
-    counts: tuple[int, int] | None = None,
-) -> Landmarks:
-    """Pairs of points from the content of a JSON file or a page.
-
-    Args:
-        content: plain data.
-        where: its name in messages.
-        source: named landmarks of the source; None for none.
-        target: of the target.
-        counts: vertices of both meshes, to check the points against.
-    """
+def parse_landmarks(content: object, where: object, counts: tuple[int, int] | None = None) -> Landmarks:
+    """Pairs of points from the content of a JSON file or a page, of meshes with so many vertices."""
     record = read_record(_File, content, where, strict=False)
     check_format(where, record.format, FORMAT)
     for key, stated, count in zip(
@@ -362,11 +350,9 @@ def parse_landmarks(
                 f"1 to {MOST} pairs on a mesh of {count}"
             )
     sides = []
-    for key, template in (("source", source), ("target", target)):
-        points = [
-            _point(getattr(row, key), f"{where}: landmark {number}, {key}", row.name, template, key)
-            for number, row in enumerate(record.landmarks, 1)
-        ]
+    for key in ("source", "target"):
+        rows = enumerate(record.landmarks, 1)
+        points = [_point(getattr(row, key), f"{where}: landmark {number}, {key}") for number, row in rows]
         corners, weights = zip(*points, strict=True)
         sides.append(SurfacePoints(np.array(corners, np.int64), np.array(weights)))
     landmarks = Landmarks(tuple(row.name for row in record.landmarks), *sides)
@@ -384,6 +370,14 @@ class _LandmarkRow:
 
 
 @dataclass(frozen=True)
+class _Inside:
+    """A point within a triangle."""
+
+    corners: tuple[Vertex, Vertex, Vertex]
+    weights: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class _File:
     """The content of a .json file of landmarks."""
 
@@ -393,31 +387,16 @@ class _File:
     target_vertices: int | None = None
 
 
-def _point(
-    value: object, where: str, name: str, template: LandmarkTemplate | None, side: str
-) -> tuple[list[int], list[float]]:
+def _point(value: object, where: str) -> tuple[Sequence[int], Sequence[float]]:
     """Corners and weights of one point of a surface."""
-    if value is None and name in NAMES:
-        value = _vertex_of(name, template, side, where)
-    if _is_index(value):
-        return [int(value)] * 3, [1.0, 0.0, 0.0]  # type: ignore[call-overload]
+    if type(value) is int and 0 <= value < 2**31:
+        return [value] * 3, [1.0, 0.0, 0.0]
     if isinstance(value, dict):
-        corners, weights = value.get("corners"), value.get("weights")
-        if (
-            isinstance(corners, list)
-            and isinstance(weights, list)
-            and len(corners) == len(weights) == 3
-            and all(_is_index(corner) for corner in corners)
-            and all(type(weight) in (int, float) and -1e-6 <= weight <= 1 + 1e-6 for weight in weights)
-            and abs(sum(weights) - 1) < 1e-3
-        ):
-            total = sum(max(weight, 0.0) for weight in weights)
-            return [int(corner) for corner in corners], [max(weight, 0.0) / total for weight in weights]
+        inside = read_record(_Inside, value, where)
+        weights = [max(weight, 0.0) for weight in inside.weights]
+        if min(inside.weights) > -1e-6 and abs(sum(weights) - 1) < 1e-3:
+            return inside.corners, [weight / sum(weights) for weight in weights]
     raise FaceDiffError(f"{where}: is {quoted(value)}; expected a vertex, or three corners with weights of sum 1")
-
-
-def _is_index(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
 
 
 def as_rows(landmarks: Landmarks) -> list[dict[str, Any]]:

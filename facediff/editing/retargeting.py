@@ -369,28 +369,20 @@ def carried_region(correspondence: Correspondence, indices: Integers) -> Indices
 
 
 def carried_pairs(correspondence: Correspondence, pairs: Integers | None) -> Indices | None:
-    """Pairs of facing vertices of the source as pairs of the target's vertices there, each pair once."""
-    if pairs is None or not len(pairs):
-        return None
-    facing_vertices = facing_pairs(correspondence, pairs)
-    different = np.unique(facing_vertices[facing_vertices[:, 0] != facing_vertices[:, 1]], axis=0)
-    return different if len(different) else None
-
-
-def facing_pairs(correspondence: Correspondence, pairs: Integers) -> Indices:
-    """For each pair (P, 2) of facing vertices of the source, a pair of the target's.
+    """Pairs (P, 2) of facing vertices of the source as pairs of the target's vertices there, each pair once.
 
     Of the vertices that lie near to the source's and on the same lip, those two face each other that are
     nearest to one another: on a coarse mesh the very nearest ones may lie far apart.
     """
+    if pairs is None or not len(pairs):
+        return None
     source = Surface(correspondence.source_vertices, correspondence.source_faces)
     points = np.einsum("vc,vcd->vd", correspondence.weights, source.vertices[correspondence.corners])
     sides = sides_of_pairs(source.vertices, source.faces, np.asarray(pairs, np.int64))
     side = (correspondence.weights * sides[correspondence.corners]).sum(axis=1)
     rest = correspondence.similarity.inverse().apply(correspondence.target_vertices)
-    target_pairs = np.empty((len(pairs), 2), np.int64)
-    every = np.arange(len(rest))
-    for row, ends in enumerate(np.asarray(pairs)):
+    every, target_pairs = np.arange(len(rest)), []
+    for ends in pairs:
         # Lips touch at rest: a vertex of the other lip is nearer than none, but never nearer than one of the same.
         above, below = (
             np.linalg.norm(points - source.vertices[vertex], axis=1)
@@ -398,8 +390,9 @@ def facing_pairs(correspondence: Correspondence, pairs: Integers) -> Indices:
             + source.size * (correspondence.share <= 0)
             for vertex, sign in zip(ends, (1.0, -1.0), strict=True)
         )
-        target_pairs[row] = facing(rest, every, above, every, below)
-    return target_pairs
+        target_pairs.append(facing(rest, every, above, every, below))
+    different = np.unique([pair for pair in target_pairs if pair[0] != pair[1]], axis=0)
+    return different if len(different) else None
 
 
 def retarget_shapes(path: Path, animation: Animation) -> ShapeSet:

@@ -37,8 +37,14 @@ class Surface:
 
     @cached_property
     def normals(self) -> Array:
-        """(V, 3) unit normals of the vertices; zero where no triangle touches."""
-        return vertex_normals(self.vertices, self.faces)
+        """(V, 3) unit normals, each the mean of its triangles' weighted by the angles at the vertex; zero without any.
+
+        Thürmer and Wüthrich, "Computing vertex normals from polygonal facets", Journal of Graphics Tools 1998: unlike
+        weights by area, these do not depend on how a flat piece is cut into triangles.
+        """
+        from trimesh import Trimesh
+
+        return np.asarray(Trimesh(self.vertices, self.faces, process=False).vertex_normals, np.float64)
 
     @cached_property
     def size(self) -> float:
@@ -77,17 +83,6 @@ class Nearest:
     normals: Array  # (N, 3) unit normals of the surface there
     distances: Array  # (N,) from the given point
     cosines: Array  # (N,) between the surface's normal and that of the given point
-
-
-def vertex_normals(vertices: Array, faces: Indices) -> Array:
-    """Unit normals (V, 3), each the mean of its triangles' weighted by the angles at the vertex.
-
-    Thürmer and Wüthrich, "Computing vertex normals from polygonal facets", Journal of Graphics Tools 1998: unlike
-    weights by area, these do not depend on how a flat piece is cut into triangles.
-    """
-    from trimesh import Trimesh
-
-    return np.asarray(Trimesh(vertices, faces, process=False).vertex_normals, np.float64)
 
 
 def edges_of(faces: Indices) -> Indices:

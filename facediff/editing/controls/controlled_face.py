@@ -17,17 +17,17 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.editing.controls import keys_of, procedural
+from facediff.editing.controls.brows import brows_of, raise_brows
 from facediff.editing.controls.direction import METADATA, Direction, channel_of, curve, direction_of
 from facediff.editing.controls.expressiveness import ALL, check_factors, read_factors, scaled_regions
 from facediff.editing.controls.eyelids import GIVE, Eyes, eyes_for
+from facediff.editing.controls.face_shapes import add_shapes, shapes_of
 from facediff.editing.controls.procedural import EDITED, PROCEDURAL, SWAYS, Amount, in_words, with_metadata
 from facediff.errors import FaceDiffError, OptionError
 from facediff.utils.numerics import Array, Floats, Integers
 
 if TYPE_CHECKING:
     from facediff.animation.options import AnimationControls
-    from facediff.editing.controls.brows import Brows
-    from facediff.editing.controls.face_shapes import Fields
 
 HEAD = ("head.pitch", "head.yaw", "head.roll")
 ACTED = ("brows", "lids", *HEAD)
@@ -86,17 +86,10 @@ class ControlledFace:
         self.factors = read_factors(controls.expressiveness)
         check_factors([*self.factors, *self._parts("expressiveness").values()], regions, name)
         self.eyes = self._needed_eyes(template, faces)
-        self.brows: Brows | None = None
-        if controls.acting is not None or "brows" in channels:
-            from facediff.editing.controls.brows import brows_of
-
-            self.brows = brows_of(template, faces, regions, unit, self.eyes)
-
-        self.shapes: Fields = {}
-        if shapes := self._parts("shape"):
-            from facediff.editing.controls.face_shapes import shapes_of
-
-            self.shapes = shapes_of(template, faces, unit, list(shapes.values()))
+        moves_brows = controls.acting is not None or "brows" in channels
+        self.brows = brows_of(template, faces, regions, unit, self.eyes) if moves_brows else None
+        shapes = list(self._parts("shape").values())
+        self.shapes = shapes_of(template, faces, unit, shapes) if shapes else {}
 
     def _parts(self, name: str) -> dict[str, str]:
         """The keyed channels of a name, and what they name after the dot, ``all`` if nothing."""
@@ -211,12 +204,8 @@ class ControlledFace:
         if amounts.expressiveness:
             animation = with_vertices(scaled_regions(animation, amounts.expressiveness, eyes))
         if amounts.shapes:
-            from facediff.editing.controls.face_shapes import add_shapes
-
             animation = with_vertices(add_shapes(procedural.copied(animation.vertices), self.shapes, amounts.shapes))
         if self.brows is not None and amounts.brows is not None:
-            from facediff.editing.controls.brows import raise_brows
-
             animation = with_vertices(raise_brows(animation, self.brows, amounts.brows))
         if amounts.gaze is not None and eyes is not None:
             animation = with_vertices(procedural.turn_eyes(animation, eyes, amounts.gaze))

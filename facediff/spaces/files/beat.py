@@ -35,9 +35,9 @@ def read_beat(path: Path) -> ParameterClip:
     stated = metadata.get("fps") if isinstance(metadata, dict) else None
     seconds = [frame.get("time") for frame in frames]
     timed = len(seconds) > 0 and None not in seconds
-    if stated is not None or not timed or len(seconds) < 2:
-        stated = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
-    rate, start, after = stated, 0.0, None
+    start, after = 0.0, None
+    if stated is not None or not timed:
+        stated = rate = check_number(path, "metadata.fps", stated, *FRAME_RATES, remedy=REMEDY)
     if timed:
         times = np.array([check_number(path, "time", time, 0, remedy=REMEDY) for time in seconds])
         rate = rate_of(path, times, [f"frame {number}" for number in range(len(times))], stated)

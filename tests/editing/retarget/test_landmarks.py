@@ -127,9 +127,6 @@ def test_names_stand_for_vertices_where_the_topology_is_known(tmp_path: Path) ->
     assert len(read_landmarks(path, known)) == 1
     with pytest.raises(FaceDiffError, match="nose_tip is not known on the source"):
         read_landmarks(path)
-    bare = {"format": "facediff landmarks 1", "landmarks": [{"name": "nose_tip", "target": 4034}]}
-    (tmp_path / "a.json").write_text(json.dumps(bare))
-    assert nearest_vertices(read_landmarks(tmp_path / "a.json", known)) == [[tip, 4034]]
 
 
 # What they do.

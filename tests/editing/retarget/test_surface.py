@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from facediff.editing.correspondence import averaging, part_pairs, pieces, smooth_field
-from facediff.editing.surface import Surface, edges_of, nearest, vertex_normals
+from facediff.editing.surface import Surface, edges_of, nearest
 
 RNG = np.random.default_rng(0)
 
@@ -61,7 +61,7 @@ def test_normals_of_a_ball_point_away_and_do_not_depend_on_the_cut() -> None:
     mesh = ball(3)
     assert (mesh.normals * mesh.vertices).sum(axis=1) == pytest.approx(1, abs=2e-3)
     cube = trimesh.creation.box()
-    normals = vertex_normals(np.array(cube.vertices), np.array(cube.faces))
+    normals = Surface(np.array(cube.vertices), np.array(cube.faces)).normals
     assert np.abs(normals) == pytest.approx(np.full((8, 3), 3**-0.5))
 
 
