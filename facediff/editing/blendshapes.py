@@ -69,39 +69,28 @@ class SolveOptions:
 
     def __post_init__(self) -> None:
         ranges.check_options(self)
-        if not self.lower < self.upper:
-            raise FaceDiffError(f"bounds {self.lower:g} to {self.upper:g}: expected the lower one first, as in 0 1")
-        if self.sparsity > 0 > self.lower:
-            raise FaceDiffError(f"bounds from {self.lower:g}: sparsity needs weights above 0; give a sparsity of 0")
+        if not self.lower < self.upper or self.sparsity > 0 > self.lower:
+            raise FaceDiffError(
+                f"bounds {self.lower:g} to {self.upper:g}: expected the lower one first, as in 0 1, and below 0 a "
+                f"sparsity of 0"
+            )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Weights:
-    """Weights of blendshapes, frame by frame, as :func:`solve` finds them.
+    """Weights of blendshapes, frame by frame, as :func:`solve` finds them."""
 
-    Attributes:
-        names: K names.
-        values: (T, K) weights.
-        residual_rms_mm: (T,) root-mean-square residual of each frame's vertices, in millimetres.
-        residual_max_mm: (T,) greatest such distance.
-        amplitude_mm: the motion's own size: root-mean-square distance of all vertices in all frames from the template.
-        frame_rate: frames a second.
-        still: names of shapes that move no vertex, so that their weights mean nothing.
-        metadata: the animation's, and how the weights were solved for.
-        head: (T, 3) rotation of the head that the weights leave out, axis-angle in radians; None if it does not move.
-        eyes: (T, 6) yaw, pitch and roll of the left and the right eye, radians as
-            :func:`facediff.spaces.files.csv_files.gaze` has them; None if only weights say where the eyes look.
-    """
-
-    names: tuple[str, ...]
-    values: Array
-    residual_rms_mm: Array
-    residual_max_mm: Array
-    amplitude_mm: float
-    frame_rate: float
-    still: tuple[str, ...] = ()
-    metadata: Mapping[str, str] = field(default_factory=dict)
-    head: Array | None = None
+    names: tuple[str, ...]  # K names
+    values: Array  # (T, K) weights
+    residual_rms_mm: Array  # (T,) root-mean-square residual of each frame's vertices, in millimetres
+    residual_max_mm: Array  # (T,) greatest such distance
+    amplitude_mm: float  # root-mean-square distance of all vertices in all frames from the template
+    frame_rate: float  # frames a second
+    still: tuple[str, ...] = ()  # names of shapes that move no vertex, so that their weights mean nothing
+    metadata: Mapping[str, str] = field(default_factory=dict)  # the animation's, and how the weights were solved for
+    head: Array | None = None  # (T, 3) rotation of the head that the weights leave out, axis-angle in radians
+    # (T, 6) yaw, pitch and roll of the left and the right eye, radians as `facediff.spaces.files.csv_files.gaze` has
+    # them; None if only weights say where the eyes look
     eyes: Array | None = None
 
     @property

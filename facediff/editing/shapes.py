@@ -55,8 +55,8 @@ class ShapeSet:
         indices = [index for index, name in enumerate(self.names) if name in names]
         if not indices:
             raise FaceDiffError(
-                f"shapes: {', '.join(self.names[:4])}{' …' if len(self.names) > 4 else ''} are none of "
-                f"{', '.join(names[:4])} …, which the table has columns for; name them so, or write a plain table"
+                f"shapes: {', '.join(self.names[:4])} … have no column in the table, as {names[0]} has; rename them or "
+                f"write a plain table"
             )
         return replace(self, names=tuple(self.names[index] for index in indices), deltas=self.deltas[indices])
 

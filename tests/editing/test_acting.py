@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from facediff.editing.acting import Acting, acted, gesture, read_acting
+from facediff.editing.acting import Acting, acted, read_acting
 from facediff.editing.controls.controlled_face import ACTED
 from tests.speech.test_prosody import RATE, SECONDS, SILENCE, voice
 
@@ -92,8 +92,3 @@ def test_frames_do_not_depend_on_speech_long_after_them(speech: np.ndarray) -> N
     np.testing.assert_array_equal(
         acted(kind, speech, FRAMES, 25.0, 0)[:before], acted(kind, other, FRAMES, 25.0, 0)[:before]
     )
-
-
-def test_gestures_begin_and_end_at_rest() -> None:
-    shape = (0.2, 0.1, 0.4)
-    assert [gesture(after, shape) for after in (-0.2, 0, 0.1, 0.5, 9)] == pytest.approx([0, 1, 1, 0, 0])

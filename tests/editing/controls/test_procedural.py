@@ -82,14 +82,6 @@ def test_rotations_turn_left_and_up() -> None:
     np.testing.assert_allclose(forward, [[1, 0, 0], [0, 1, 0], [0, 0, 1]], atol=1e-12)
 
 
-def test_the_centre_of_a_sphere_is_found_from_a_part_of_it() -> None:
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(60, 3))
-    directions[:, 2] = np.abs(directions[:, 2]) + 1.0
-    points = 0.012 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [3.0, -2.0, 1.0]
-    np.testing.assert_allclose(sphere_centre(points), [3.0, -2.0, 1.0], atol=1e-9)
-
-
 def test_sway_moves_the_head_as_one_within_its_bounds(make_animation: Callable[..., Animation]) -> None:
     animation = make_animation(250, jawOpen=np.linspace(0, 1, 250))
     made = add_sway(animation, degrees=3, seed=5)
