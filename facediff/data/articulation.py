@@ -30,21 +30,13 @@ LABIODENTALS = ("f", "v")
 
 @dataclass(frozen=True, eq=False)
 class MouthMotion:
-    """The mouth of a recording, and its words.
+    """The mouth of a recording, and its words."""
 
-    Attributes:
-        gap: (T,) between the inner lips, in millimetres beyond that of the face at rest.
-        width: (T,) from corner to corner, the same.
-        frame_rate: frames a second; frame t shows the face at (t + 0.5) / frame_rate.
-        phonemes: with times in seconds.
-        contact: (T,) from the lower lip to the upper teeth in millimetres, of faces that have teeth.
-    """
-
-    gap: Array
-    width: Array
-    frame_rate: float
-    phonemes: Sequence[TimedPhoneme]
-    contact: Array | None = None
+    gap: Array  # (T,) between the inner lips, in millimetres beyond that of the face at rest
+    width: Array  # (T,) from corner to corner, the same
+    frame_rate: float  # frames a second; frame t shows the face at (t + 0.5) / frame_rate
+    phonemes: Sequence[TimedPhoneme]  # with times in seconds
+    contact: Array | None = None  # (T,) from the lower lip to the upper teeth in millimetres, of faces that have teeth
 
     def around(self, series: Array, phoneme: TimedPhoneme, pick: Callable[[Array], float]) -> float:
         """The smallest, largest … value within :data:`NEAR` of a phoneme's middle."""
@@ -90,25 +82,15 @@ def mouth_motion(
 
 @dataclass(frozen=True)
 class ArticulationScores:
-    """Scores of one or several recordings; NaN where their speech does not have the sounds.
+    """Scores of one or several recordings; NaN where their speech does not have the sounds."""
 
-    Attributes:
-        closure_auc: how well gaps tell p, b and m from all other sounds: 0.5 by chance, 1 at best.
-        closed: share of p, b and m at which the lips come within 1 mm.
-        chance: the same share of all other sounds.
-        open_vowels: mean opening of a, ɑ, æ … in millimetres.
-        rounding: width of the mouth at u, o and w less that at other vowels, in millimetres; negative if it rounds.
-        rounding_auc: how well widths tell these sounds apart.
-        contact: share of f and v at which the lower lip comes within 1 mm of the upper teeth.
-    """
-
-    closure_auc: float
-    closed: float
-    chance: float
-    open_vowels: float
-    rounding: float
-    rounding_auc: float
-    contact: float = math.nan
+    closure_auc: float  # how well gaps tell p, b and m from all other sounds: 0.5 by chance, 1 at best
+    closed: float  # share of p, b and m at which the lips come within 1 mm
+    chance: float  # the same share of all other sounds
+    open_vowels: float  # mean opening of a, ɑ, æ … in millimetres
+    rounding: float  # width of the mouth at u, o and w less that at other vowels, in millimetres; negative if it rounds
+    rounding_auc: float  # how well widths tell these sounds apart
+    contact: float = math.nan  # share of f and v at which the lower lip comes within 1 mm of the upper teeth
 
     def shares_of(self, truth: ArticulationScores) -> dict[str, float]:
         """Every score as a share of the truth's; NaN where that is 0."""

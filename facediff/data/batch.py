@@ -229,27 +229,18 @@ DATA_SOURCE_KEY = "facediff_data"
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference motion that carries a speaking style.
+    """A reference motion that carries a speaking style."""
 
-    Attributes:
-        clip: the clip that it comes from.
-        motion: offsets from the template, half precision to keep checkpoints small.
-    """
-
-    clip: str
-    motion: Float[Tensor, "frames points dims"]
+    clip: str  # the clip that it comes from
+    motion: Float[Tensor, "frames points dims"]  # offsets from the template, half precision to keep checkpoints small
 
 
 @dataclass(frozen=True)
 class Rig:
-    """What turns the channels of a corpus into vertices: each speaker's own shapes.
+    """What turns the channels of a corpus into vertices: each speaker's own shapes."""
 
-    Attributes:
-        mesh: the same corpus as vertices: neutral faces, triangles, colours, regions, inner lips.
-        deltas: by speaker, what each channel of :attr:`Space.face` moves the vertices by at 1, (K, V, 3).
-    """
-
-    mesh: Assets
+    mesh: Assets  # the same corpus as vertices: neutral faces, triangles, colours, regions, inner lips
+    # by speaker, what each channel of face moves the vertices by at 1, (K, V, 3)
     deltas: dict[str, Float[Tensor, "face vertices 3"]]
 
     @classmethod

@@ -61,19 +61,13 @@ FLAME_SOURCES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Circulating:
-    """Facts about the copies of a corpus that circulate, by which ``facediff data check`` compares a folder.
+    """Facts about the copies of a corpus that circulate, by which ``facediff data check`` compares a folder."""
 
-    Attributes:
-        counts: split, clips and frames that published scoring scripts report.
-        templates: projects with a ``templates.pkl`` in their repository, by the beginning of the file's git blob id.
-        unit_area: whether templates have a surface area of one.
-        incomplete: whether some clips were never recorded.
-    """
-
-    counts: tuple[str, int, int] | None = None
+    counts: tuple[str, int, int] | None = None  # split, clips and frames that published scoring scripts report
+    # projects with a templates.pkl in their repository, by the beginning of the file's git blob id
     templates: Mapping[str, str] = field(default_factory=dict)
-    unit_area: bool = False
-    incomplete: bool = False
+    unit_area: bool = False  # whether templates have a surface area of one
+    incomplete: bool = False  # whether some clips were never recorded
 
 
 @dataclass(frozen=True)

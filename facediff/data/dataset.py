@@ -310,20 +310,15 @@ ReferenceChoice = Literal["same_subject", "any_mood", "self"]
 
 @dataclass(frozen=True)
 class ReferencePolicy:
-    """Chooses the clip that a target takes its style reference from.
+    """Chooses the clip that a target takes its style reference from."""
 
-    Attributes:
-        candidates: possible references by identity; never a clip of an evaluated split where there are others.
-        same: clip attributes that target and reference share where possible, e.g. the mood.
-        choice: another clip of the same speaker (``same_subject``); in training also such a clip of any mood
-            (``any_mood``), or the target itself (``self``).
-        max_frames: longest reference; longer clips are cut to a window.
-    """
-
+    # possible references by identity; never a clip of an evaluated split where there are others
     candidates: dict[str, list[Clip]]
-    same: tuple[str, ...]
+    same: tuple[str, ...]  # clip attributes that target and reference share where possible, e.g. the mood
+    # another clip of the same speaker (same_subject); in training also such a clip of any mood (any_mood), or the
+    # target itself (self)
     choice: ReferenceChoice
-    max_frames: int
+    max_frames: int  # longest reference; longer clips are cut to a window
 
     def check(self, targets: Sequence[Clip]) -> None:
         """Fail before training if a clip has no style reference."""

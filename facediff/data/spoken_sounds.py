@@ -70,19 +70,12 @@ def sounds_in_frames(phonemes: Sequence[TimedPhoneme], frames: int, frame_rate: 
 
 @dataclass(frozen=True, eq=False)
 class SoundBatch:
-    """Pieces of speech with their sounds.
+    """Pieces of speech with their sounds."""
 
-    Attributes:
-        audio: (batch, samples) at 16 kHz, padded with zeros.
-        audio_lengths: (batch,) valid samples.
-        frame_lengths: (batch,) valid frames.
-        sounds: (batch, frames), places in :data:`SOUNDS`, :data:`IGNORED` on padding.
-    """
-
-    audio: Tensor
-    audio_lengths: Tensor
-    frame_lengths: Tensor
-    sounds: Tensor
+    audio: Tensor  # (batch, samples) at 16 kHz, padded with zeros
+    audio_lengths: Tensor  # (batch,) valid samples
+    frame_lengths: Tensor  # (batch,) valid frames
+    sounds: Tensor  # (batch, frames), places in SOUNDS, IGNORED on padding
 
 
 class SpokenSounds:

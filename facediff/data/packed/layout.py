@@ -76,48 +76,29 @@ PlainName = Annotated[str, PLAIN_NAME]
 
 @dataclass(frozen=True)
 class PackedSound:
-    """The place and form of a clip's speech.
+    """The place and form of a clip's speech."""
 
-    Attributes:
-        first: its first byte in ``speech``.
-        pieces: bytes of each of its streams.
-        form: ``flac``, or ``wav`` for a recording that was kept as it was, since FLAC cannot hold its samples.
-        rate: samples a second.
-        channels: number of channels.
-        samples: samples of each channel.
-        bits: bits of a sample, 16 or 24; 0 for a recording kept as it was.
-    """
-
-    first: Whole
-    pieces: tuple[Positive, ...]
+    first: Whole  # its first byte in speech
+    pieces: tuple[Positive, ...]  # bytes of each of its streams
+    # flac, or wav for a recording that was kept as it was, since FLAC cannot hold its samples
     form: Literal["flac", "wav"]
-    rate: Annotated[int, Range(*SAMPLE_RATES)]
-    channels: Annotated[int, Range(1, 64)]
-    samples: Positive
-    bits: Literal[0, 16, 24]
+    rate: Annotated[int, Range(*SAMPLE_RATES)]  # samples a second
+    channels: Annotated[int, Range(1, 64)]  # number of channels
+    samples: Positive  # samples of each channel
+    bits: Literal[0, 16, 24]  # bits of a sample, 16 or 24; 0 for a recording kept as it was
 
 
 @dataclass(frozen=True)
 class PackedClip:
-    """The place of a clip in the arrays.
+    """The place of a clip in the arrays."""
 
-    Attributes:
-        name: the clip's name.
-        identity: who speaks.
-        coding: names the motion array.
-        dtype: type of the vertices before they were packed.
-        first: its first row in that array.
-        frames: its number of frames.
-        sound: its speech.
-    """
-
-    name: PlainName
-    identity: PlainName
-    coding: Coding
-    dtype: ExactCoding
-    first: Whole
-    frames: Positive
-    sound: PackedSound
+    name: PlainName  # the clip's name
+    identity: PlainName  # who speaks
+    coding: Coding  # names the motion array
+    dtype: ExactCoding  # type of the vertices before they were packed
+    first: Whole  # its first row in that array
+    frames: Positive  # its number of frames
+    sound: PackedSound  # its speech
 
 
 @dataclass(frozen=True)
@@ -132,23 +113,14 @@ class PackedFile:
 
 @dataclass(frozen=True)
 class ArrayInfo:
-    """Shape and chunks of an array, which is divided along its first axis.
+    """Shape and chunks of an array, which is divided along its first axis."""
 
-    Attributes:
-        dtype: type of its numbers.
-        rows: length of the first axis.
-        width: length of the second axis; 0 for an array of one axis.
-        chunk: rows of a chunk.
-        chunks: chunks of a shard.
-        shards: bytes of each shard's file.
-    """
-
-    dtype: str
-    rows: Whole
-    width: Whole
-    chunk: Annotated[int, Range(1, 2**31)]
-    chunks: Annotated[int, Range(1, 2**20)]
-    shards: tuple[Whole, ...]
+    dtype: str  # type of its numbers
+    rows: Whole  # length of the first axis
+    width: Whole  # length of the second axis; 0 for an array of one axis
+    chunk: Annotated[int, Range(1, 2**31)]  # rows of a chunk
+    chunks: Annotated[int, Range(1, 2**20)]  # chunks of a shard
+    shards: tuple[Whole, ...]  # bytes of each shard's file
 
     @property
     def chunk_bytes(self) -> int:
@@ -158,35 +130,20 @@ class ArrayInfo:
 
 @dataclass(frozen=True)
 class Record:
-    """The record of a packed corpus.
+    """The record of a packed corpus."""
 
-    Attributes:
-        made_by: version of facediff that packed it.
-        corpus: name of the corpus.
-        n_vertices: vertices of its meshes.
-        frame_rate: stored motion frames a second.
-        tolerance: millimetres by which a coordinate may differ from the original; 0 for lossless packing.
-        step: one step of the stored offsets in the corpus's unit; 0 for lossless packing.
-        unit: the corpus's unit of length; any text for lossless packing, which does not use it.
-        chunk_seconds: the requested length of a chunk.
-        identities: rows of ``templates``.
-        clips: every clip, by name.
-        files: every other file, by path.
-        arrays: the arrays, by name.
-    """
-
-    made_by: Name
-    corpus: Name
-    n_vertices: Positive
-    frame_rate: Annotated[float, Range(*FRAME_RATES)]
-    tolerance: Number
-    step: Number
-    unit: Name
-    chunk_seconds: Number
-    identities: tuple[PlainName, ...]
-    clips: Mapping[str, PackedClip] = field(default_factory=dict)
-    files: Mapping[str, PackedFile] = field(default_factory=dict)
-    arrays: Mapping[str, ArrayInfo] = field(default_factory=dict)
+    made_by: Name  # version of facediff that packed it
+    corpus: Name  # name of the corpus
+    n_vertices: Positive  # vertices of its meshes
+    frame_rate: Annotated[float, Range(*FRAME_RATES)]  # stored motion frames a second
+    tolerance: Number  # millimetres by which a coordinate may differ from the original; 0 for lossless packing
+    step: Number  # one step of the stored offsets in the corpus's unit; 0 for lossless packing
+    unit: Name  # the corpus's unit of length; any text for lossless packing, which does not use it
+    chunk_seconds: Number  # the requested length of a chunk
+    identities: tuple[PlainName, ...]  # rows of templates
+    clips: Mapping[str, PackedClip] = field(default_factory=dict)  # every clip, by name
+    files: Mapping[str, PackedFile] = field(default_factory=dict)  # every other file, by path
+    arrays: Mapping[str, ArrayInfo] = field(default_factory=dict)  # the arrays, by name
 
     @classmethod
     def read(cls, text: bytes, source: str) -> Record:

@@ -191,21 +191,13 @@ class PackedCorpus:
 
 @dataclass(frozen=True, eq=False)
 class PackedMotion:
-    """The motion of one clip of a packed corpus.
+    """The motion of one clip of a packed corpus."""
 
-    Attributes:
-        source: the corpus, for messages.
-        record: of the corpus.
-        clip: the clip.
-        array: that holds its rows.
-        decoded: cache of chunks.
-    """
-
-    source: str
-    record: Record
-    clip: PackedClip
-    array: ShardedArray
-    decoded: DecodedChunks
+    source: str  # the corpus, for messages
+    record: Record  # of the corpus
+    clip: PackedClip  # the clip
+    array: ShardedArray  # that holds its rows
+    decoded: DecodedChunks  # cache of chunks
 
     @property
     def frames(self) -> int:

@@ -45,17 +45,11 @@ FOLDER = "recordings"
 
 @dataclass(frozen=True)
 class Offset:
-    """Where the motion's beginning lies in the sound.
+    """Where the motion's beginning lies in the sound."""
 
-    Attributes:
-        seconds: of the sound before the motion begins; negative where the motion begins first.
-        correlation: of loudness and the mouth's opening there; at most 1.
-        found: whether it was found, or stated by the user.
-    """
-
-    seconds: float
-    correlation: float
-    found: bool
+    seconds: float  # of the sound before the motion begins; negative where the motion begins first
+    correlation: float  # of loudness and the mouth's opening there; at most 1
+    found: bool  # whether it was found, or stated by the user
 
 
 @dataclass(frozen=True)

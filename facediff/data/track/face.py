@@ -30,19 +30,12 @@ EYE_RADIUS = 12.0  # millimetres from the eye's centre to the iris
 
 @dataclass(frozen=True)
 class PosedFaces:
-    """Faces without head motion, and the motion.
+    """Faces without head motion, and the motion."""
 
-    Attributes:
-        faces: (T, 478, 3) in millimetres, irises included; NaN where no face was visible.
-        angles: (T, 3) pitch (chin down), yaw (to the face's left) and roll (towards its left shoulder) in degrees.
-        scales: (T,) pixels to a millimetre.
-        centres: (T, 2) centre of the head in pixels.
-    """
-
-    faces: Array
-    angles: Array
-    scales: Array
-    centres: Array
+    faces: Array  # (T, 478, 3) in millimetres, irises included; NaN where no face was visible
+    angles: Array  # (T, 3) pitch (chin down), yaw (to the face's left) and roll (towards its left shoulder) in degrees
+    scales: Array  # (T,) pixels to a millimetre
+    centres: Array  # (T, 2) centre of the head in pixels
 
 
 def upright(landmarks: npt.NDArray[np.floating]) -> Array:

@@ -39,23 +39,15 @@ SHAPES: dict[str, list[tuple[int, ...]]] = {
 
 @dataclass(frozen=True)
 class FaceModel:
-    """The content of the file.
+    """The content of the file."""
 
-    Attributes:
-        detector: graph of the face detector: image (1, 128, 128, 3) in −1 … 1; boxes (1, 896, 16), logits (1, 896, 1).
-        landmarker: graph of the landmarks: image (1, 256, 256, 3) in 0 … 1; 478 points, logit of a face's presence.
-        canonical: (468, 3) canonical face in cm, y up, z to the viewer.
-        triangles: (898, 3) of the canonical face.
-        weights: (468,) weights of the points by which a head's pose is found; most are 0.
-        digest: SHA-256 of the file.
-    """
-
+    # graph of the face detector: image (1, 128, 128, 3) in −1 … 1; boxes (1, 896, 16), logits (1, 896, 1)
     detector: bytes
-    landmarker: bytes
-    canonical: Array
-    triangles: npt.NDArray[np.int64]
-    weights: Array
-    digest: str
+    landmarker: bytes  # graph of the landmarks: image (1, 256, 256, 3) in 0 … 1; 478 points, logit of a face's presence
+    canonical: Array  # (468, 3) canonical face in cm, y up, z to the viewer
+    triangles: npt.NDArray[np.int64]  # (898, 3) of the canonical face
+    weights: Array  # (468,) weights of the points by which a head's pose is found; most are 0
+    digest: str  # SHA-256 of the file
 
 
 def read_face_model(path: Path | None) -> FaceModel:

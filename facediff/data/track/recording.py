@@ -86,23 +86,14 @@ def _track(model: FaceModel, options: TrackingOptions, task: FileTask) -> list[P
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A video that was tracked.
+    """A video that was tracked."""
 
-    Attributes:
-        source: the video.
-        landmarks: (T, 478, 3) in pixels, NaN where no face was seen; in a file.
-        times: (T,) seconds from the first frame.
-        presence: (T,) logit of a face, NaN where none was seen.
-        speech: (S,) at 16 kHz, from the first frame on.
-        repeated: frames that show the picture before them.
-    """
-
-    source: Path
-    landmarks: npt.NDArray[np.float32]
-    times: Array
-    presence: Array
-    speech: npt.NDArray[np.float32]
-    repeated: int
+    source: Path  # the video
+    landmarks: npt.NDArray[np.float32]  # (T, 478, 3) in pixels, NaN where no face was seen; in a file
+    times: Array  # (T,) seconds from the first frame
+    presence: Array  # (T,) logit of a face, NaN where none was seen
+    speech: npt.NDArray[np.float32]  # (S,) at 16 kHz, from the first frame on
+    repeated: int  # frames that show the picture before them
 
     @classmethod
     def open(cls, task: FileTask) -> Recording:
@@ -130,17 +121,11 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class RecordingSummary:
-    """Measures of all frames of a recording.
+    """Measures of all frames of a recording."""
 
-    Attributes:
-        parts: first frame, and frame after the last, of the parts without cuts and long gaps.
-        face_pixels: median width of the face.
-        sample: (N, 478, 3) landmarks of frames evenly spread over the parts.
-    """
-
-    parts: list[tuple[int, int]]
-    face_pixels: float
-    sample: npt.NDArray[np.float32]
+    parts: list[tuple[int, int]]  # first frame, and frame after the last, of the parts without cuts and long gaps
+    face_pixels: float  # median width of the face
+    sample: npt.NDArray[np.float32]  # (N, 478, 3) landmarks of frames evenly spread over the parts
 
 
 def summarise(recording: Recording, model: FaceModel, sample_size: int) -> RecordingSummary:

@@ -38,17 +38,11 @@ def anchor_centres() -> Array:
 
 @dataclass(frozen=True)
 class Face:
-    """A face that was detected, in pixels of the picture.
+    """A face that was detected, in pixels of the picture."""
 
-    Attributes:
-        box: left, top, right, bottom.
-        eyes: (2, 2) the right and the left eye.
-        score: of the detector, 0 to 1.
-    """
-
-    box: Array
-    eyes: Array
-    score: float
+    box: Array  # left, top, right, bottom
+    eyes: Array  # (2, 2) the right and the left eye
+    score: float  # of the detector, 0 to 1
 
     @property
     def centre(self) -> Array:
