@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -52,7 +52,6 @@ def generation_metrics(
     *,
     splits: Annotated[Sequence[str] | None, Option(metavar="NAME,…")] = None,
     max_clips: Annotated[ranges.Samples | None, Option(metavar="N")] = None,
-    against: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
     data_root: Folder = None,
     corpus: Corpus = None,
     eyelid_pairs: FileOrList = None,
@@ -73,13 +72,11 @@ def generation_metrics(
     For example:
       facediff generation-metrics demo/puppet.ckpt
       facediff generation-metrics a.ckpt b.ckpt c.ckpt --sampler ddpm --steps 1000 --samples 4 --json abc.json
-      facediff generation-metrics new.ckpt --against abc.json
 
     Args:
         checkpoints: trained models (.ckpt) of one corpus
         splits: val, test_a, test_b, test_c (default: all test splits)
         max_clips: clips of a split at most, evenly spread, for a quick look (default: all)
-        against: a checkpoint, or a file of --json: its values are printed next to these with the ratios
         data_root: where the corpus is, if not where it was in training
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class
         eyelid_pairs: file with pairs of eyelid vertices (default: regions/eyelid_pairs.txt in the corpus's folder)
@@ -90,15 +87,10 @@ def generation_metrics(
         samples: how many motions, and how they are sampled.
         licence: which models are refused.
     """
-    for path in [*checkpoints, *([] if against is None else [against])]:
+    for path in checkpoints:
         check_model_source(path)
     check_known("--splits", "split", splits or (), SPLITS)
-    stored = None
-    if against is not None and against.suffix.lower() == ".json":
-        from facediff.utils.plain_files import load_json
-
-        stored = load_json(against, name=f"--against {against}")
-    from facediff.models.generation_metrics import SamplingOptions, means_of, measure
+    from facediff.models.generation_metrics import SamplingOptions, measure
     from facediff.models.loading import load_model
     from facediff.pipelines.trained import usable_device
     from facediff.utils.plain_files import write_json, write_rows
@@ -108,28 +100,13 @@ def generation_metrics(
     expressivity = None if word is None else ranges.EXPRESSIVITY.read("--expressivity", word)
     sampling = SamplingOptions(**{**vars(samples), "expressivity": expressivity})
     device = usable_device(device)
-    reference = {} if stored is None else means_of(stored, f"--against {against}")
     data = corpus_of_checkpoint(checkpoints[0], data_root, corpus, eyelid_pairs)
     splits = list(dict.fromkeys(splits)) if splits else data.test_splits
-    compared = [] if against is None or reference else [against]
     counts = [min(len(data.clips(name)), max_clips or 10**9) for name in splits]
-    total = sum(counts) * (len(checkpoints) + len(compared))
-    with progress_bar("clips", total, shown=not quiet) as step:
-
-        def results(paths: list[Path]) -> GenerationScores:
-            models = {
-                str(path): partial(load_model, path, device, commercial_only=licence.commercial_only) for path in paths
-            }
-            return measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
-
-        scores = results(checkpoints)
-        if compared:
-            earlier = results(compared)
-            reference = {
-                split: {name: earlier.mean(split, name) for name in values} for split, values in earlier.values.items()
-            }
-    if against is not None:
-        scores = replace(scores, against=reference, against_name=str(against))
+    commercial_only = licence.commercial_only
+    models = {str(path): partial(load_model, path, device, commercial_only=commercial_only) for path in checkpoints}
+    with progress_bar("clips", sum(counts) * len(checkpoints), shown=not quiet) as step:
+        scores = measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
     if json is not None:
         write_json(json, scores.as_dict())
     if csv is not None:
@@ -162,8 +139,6 @@ def text(scores: GenerationScores) -> str:
     lines = [f"{kind} {scores.corpus}; clips: {counts}; {sampled}; {scores.sampler}"]
     if len(scores.checkpoints) > 1:
         lines.append(f"mean ± standard deviation over {len(scores.checkpoints)} checkpoints")
-    if scores.against_name:
-        lines.append(f"in brackets: the ratio to {scores.against_name}")
     rows = []
     for name in GENERATION_METRICS:
         cells: list[str | None] = []
@@ -172,9 +147,6 @@ def text(scores: GenerationScores) -> str:
             cell = None if mean is None else number(mean)
             if cell is not None and deviation is not None:
                 cell += f" ± {number(deviation)}"
-            reference = scores.against.get(split, {}).get(name)
-            if cell is not None and mean is not None and reference:
-                cell += f" [{mean / reference:.3f}]"
             cells.append(cell)
         if any(cell is not None for cell in cells):
             rows.append([scores.title(name), *cells])

@@ -25,7 +25,7 @@ from facediff.data.articulation import MouthMotion, articulation, mouth_motion
 from facediff.data.batch import UNKNOWN_IDENTITY
 from facediff.data.corpus import LIP_TEETH_PAIRS
 from facediff.data.dataset import MotionDataset
-from facediff.errors import FaceDiffError, counted, damaged
+from facediff.errors import FaceDiffError, counted
 from facediff.metrics import (
     MeanVertexError,
     MotionLiveliness,
@@ -428,8 +428,6 @@ class GenerationScores:
         clips: how many, by split.
         values: one for each checkpoint, by split and metric.
         missing: why metrics have no value.
-        against: mean values of another method, by split and metric.
-        against_name: what that method is called.
     """
 
     corpus: str
@@ -441,8 +439,6 @@ class GenerationScores:
     clips: dict[str, int]
     values: dict[str, dict[str, list[float | None]]]
     missing: dict[str, str] = field(default_factory=dict)
-    against: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    against_name: str = ""
 
     def mean(self, split: str, name: str) -> float | None:
         """Mean over the checkpoints that have a value."""
@@ -464,45 +460,29 @@ class GenerationScores:
         table = []
         for split, values in self.values.items():
             for name in GENERATION_METRICS:
-                mean, against = self.mean(split, name), self.against.get(split, {}).get(name)
                 row: dict[str, Any] = {
                     "split": split,
                     "metric": name,
                     "title": self.title(name),
-                    "mean": mean,
+                    "mean": self.mean(split, name),
                     "std": self.deviation(split, name),
                 }
-                if self.against_name:
-                    row |= {"against": against, "ratio": mean / against if mean is not None and against else None}
                 numbered = {f"value_{number}": value for number, value in enumerate(values[name], 1)}
                 table.append(row | numbered)
         return table
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON, as :func:`means_of` reads them again."""
-        facts = {name: value for name, value in vars(self).items() if name not in ("values", "against")}
-        keys = ("split", "metric", "title", "mean", "std", "against", "ratio")
+        """Plain data for JSON."""
+        facts = {name: value for name, value in vars(self).items() if name != "values"}
+        keys = ("split", "metric", "title", "mean", "std")
         scores = [
-            {key: row[key] for key in keys if key in row} | {"values": self.values[row["split"]][row["metric"]]}
+            {key: row[key] for key in keys} | {"values": self.values[row["split"]][row["metric"]]}
             for row in self.rows()
         ]
         return {"format": FORMAT, **facts, "metrics": scores}
 
 
 FORMAT = "facediff generation metrics 1"
-
-
-def means_of(content: object, source: object) -> dict[str, dict[str, float | None]]:
-    """Mean values by split and metric from what :meth:`GenerationScores.as_dict` gave."""
-    means: dict[str, dict[str, float | None]] = {}
-    with damaged(source, "expected a file of `facediff generation-metrics --json`"):
-        rows: Any = content["metrics"] if content["format"] == FORMAT else []  # type: ignore[index]
-        if not rows:
-            raise ValueError("holds no generation metrics")
-        for row in rows:
-            mean = row["mean"]
-            means.setdefault(str(row["split"]), {})[str(row["metric"])] = None if mean is None else float(mean)
-    return means
 
 
 def measure(
