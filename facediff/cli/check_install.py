@@ -32,7 +32,7 @@ def check_install() -> None:
     tell(f"Python {platform.python_version()} ({sys.executable}) on {platform.platform()}")
     versions = {name: version for name in PACKAGES if (version := version_of(name))}
     tell("packages: " + ", ".join(f"{name} {version}" for name, version in versions.items()))
-    tell(f"devices: {devices('torch' in versions)}")
+    tell(f"devices: {devices()}")
     started = time.monotonic()
     try:
         animation = trial()
@@ -74,16 +74,13 @@ def version_of(package: str) -> str | None:
         return None
 
 
-def devices(with_torch: bool) -> str:
+def devices() -> str:
     """Processors, and PyTorch's other devices."""
     processors = f"{os.cpu_count()} processors ({platform.machine()})"
-    if not with_torch:
-        return f"{processors}; graphics cards are used by PyTorch only, which is not installed"
     try:
         import torch
-    except (ImportError, OSError) as error:  # a library that it loads is missing
-        return f"{processors}; PyTorch is installed and cannot be imported ({shortened(printable(error))})"
-    if torch.cuda.is_available():
-        cards = ", ".join(torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count()))
-        return f"{processors}, {cards} (CUDA {torch.version.cuda})"
-    return f"{processors}, {'Apple MPS' if torch.backends.mps.is_available() else 'no graphics card for PyTorch'}"
+    except (ImportError, OSError) as error:  # it is absent, or a library that it loads
+        return f"{processors}; PyTorch cannot be imported ({shortened(printable(error))})"
+    cards = [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]
+    cards += ["Apple MPS"] if torch.backends.mps.is_available() else []
+    return ", ".join([processors, *cards]) + ("" if cards else "; no graphics card for PyTorch")

@@ -9,7 +9,6 @@ import datetime  # noqa: F401 - before NumPy, which makes an ImportError of a Ct
 import errno
 import io
 import os
-import re
 import signal
 import sys
 import warnings
@@ -30,15 +29,6 @@ TRACEBACK = "FACEDIFF_TRACEBACK"
 """Environment variable that shows the traceback of an unexpected error in place of a sentence."""
 LONG, LARGE = 3600.0, 8 * 2**30
 """Seconds and bytes above which a command names its cost and waits for a yes."""
-
-
-LOST_PROCESS = re.compile(
-    r"(gloo|NCCL|ProcessGroup|TCPStore|store).*"
-    r"(onnection (closed|reset|refused)|roken pipe|imed? ?out|remote process exited|recvValue|sendBytes)"
-    r"|DataLoader worker .*(killed|exited)",
-    re.IGNORECASE,
-)
-"""PyTorch's words where another process of a distributed run, or one that reads data, has gone."""
 
 
 class StandardOutputError(FaceDiffError):
@@ -187,11 +177,6 @@ def report(error: BaseException) -> int:
     if isinstance(error, OSError):
         name = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
-    if isinstance(error, RuntimeError) and LOST_PROCESS.search(text):
-        return fail(
-            f"another process of the run ended, or cannot be reached: {text[:100]}; see its own message, or whether "
-            f"memory ran out, and continue a training with --ckpt_path last ({more})"
-        )
     refusal = next((cause for cause in chain(error) if _refuses(cause)), None)
     if refusal is not None:
         return fail(f"{' '.join(str(refusal).split())} ({more})")
@@ -216,8 +201,8 @@ def chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-LIBRARIES = ("lightning", "omegaconf", "wandb")
-"""Their own messages name the option."""
+LIBRARIES = ("lightning", "omegaconf", "wandb", "torch.distributed", "torch.utils.data", "torch.autograd")
+"""Their own messages name the option, or the process that has gone."""
 
 
 def _refuses(error: BaseException) -> bool:
@@ -227,7 +212,7 @@ def _refuses(error: BaseException) -> bool:
         trace = trace.tb_next
     module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
     fault = isinstance(error, AttributeError | KeyError | IndexError | AssertionError | OSError)
-    return module.partition(".")[0] in LIBRARIES and not fault
+    return module.startswith(LIBRARIES) and not fault
 
 
 def _position(error: BaseException) -> tuple[str, bool]:

@@ -503,11 +503,6 @@ class Audio2FaceAnimator(Animator):
             options.setdefault("frame_rate", self.frame_rate)
         return super()._options(dtype, **options)
 
-    @property
-    def emotions(self) -> tuple[str, ...]:
-        """The emotions that have a strength."""
-        return cast("Audio2Face", self.model).folder.facts.emotions
-
     def solve(self, part: Part, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """NVIDIA's weights (T, K) of the folder's blendshapes for vertices.
 

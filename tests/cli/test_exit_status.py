@@ -109,16 +109,6 @@ class CudaError(RuntimeError):
         (MemoryError(), 2),
         (CudaError("CUDA out of memory. Tried to allocate 2 GiB"), 2),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 2),
-        (
-            RuntimeError("[gloo/transport/tcp/pair.cc:534] Connection closed by peer [::1]:9"),
-            2,
-        ),
-        (
-            RuntimeError("NCCL communicator was aborted on rank 1: remote process exited or network error"),
-            2,
-        ),
-        (RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "), 2),
-        (RuntimeError("[Rank 0] Watchdog caught collective operation timeout: ProcessGroupNCCL timed out"), 2),
         (PermissionError(13, "Permission denied", "secret.npz"), 2),
         (TypeError("fault\nof two lines"), 70),
     ],
