@@ -117,7 +117,7 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
         checkpoints[training.name] = runner.fit(training, checkpoints, cell)
     checkpoint = cell.source if cell.source is not None else checkpoints[cell.trainings[-1].name]
     run = folder / f"test-{cell.key[:12]}"
-    arguments = ["test", "--ckpt_path", str(checkpoint), *logger_words(run), *progress_words()]
+    arguments = ["test", "--ckpt_path", str(checkpoint), *run_words(run)]
     metrics = list(dict.fromkeys([*setting.metrics, "real_time_factor"]))
     root = cell.root or (setting.roots.get(cell.corpus) if cell.kind == "checkpoint" else None)
     options = {
@@ -175,7 +175,7 @@ class Runner:
                 discard(folder)
             folder.mkdir(parents=True, exist_ok=True)
             write_json(folder / STATE, {"seconds": before, "started": time.time()})
-            self.run(training.name, [*arguments, *logger_words(folder), *option_words(options), *progress_words()])
+            self.run(training.name, [*arguments, *run_words(folder), *option_words(options)])
             took = self.measured[training.name]
             took["seconds"] = before + (took["seconds"] or 0.0)
             write_json(folder / STATE, {"done": True, **took})
@@ -245,19 +245,16 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
     return arguments
 
 
-def logger_words(run: Path) -> list[str]:
-    """The options that put a run of Lightning's commands into a folder."""
+def run_words(run: Path) -> list[str]:
+    """The options that put a run of Lightning's commands into a folder, without bars in the log."""
     return [
         f"--trainer.logger={LOGGER}",
         f"--trainer.logger.save_dir={run.parent}",
         f"--trainer.logger.name={run.name}",
         "--trainer.logger.version=0",
+        "--trainer.enable_progress_bar=false",
+        "--trainer.enable_model_summary=false",
     ]
-
-
-def progress_words() -> list[str]:
-    """No bars in the log."""
-    return ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
 
 
 def run_process(command: Sequence[str], environment: Mapping[str, str], log: IO[bytes]) -> tuple[int, float | None]:
