@@ -108,7 +108,7 @@ class GenerationOptions(CheckedOptions):
         guidance: follow conditions more than the model would by itself, style=1.5,speech=1.2,identity=1.3, where it was
             trained for that (default: the checkpoint's, usually 1)
         seed: seed of the noise; equal seeds give equal motion
-        voice_gate: what finds the pauses, in which the mouth comes to rest: energy or webrtc, with options
+        voice_gate: what finds the pauses, in which the mouth comes to rest: energy or silero, with options
             (energy:release=0.3); off for the model's own motion there (default: energy, but off for imported models)
         frame_rate: frames a second of Audio2Face-3D, which has no rate of its own (default: 30)
         mesh: triangles of Audio2Face-3D's face, whose folder has none: a mesh with the same vertices

@@ -14,29 +14,14 @@ from facediff.errors import FaceDiffError
 CHUNK = 0.02
 """Seconds of speech that are read at a time, at most."""
 
-SOUND_FILES = (
-    b"RIFF",
-    b"RIFX",
-    b"RF64",
-    b"fLaC",
-    b"OggS",
-    b"FORM",
-    b"caff",
-    b"ID3",
-    b"FLV\1",
-    b"\x1a\x45\xdf\xa3",
-    b"#!AMR",
-)
+SOUND_FILES = (*b"RIFF RIFX RF64 fLaC OggS FORM caff ID3 FLV\1 #!AMR".split(), b"\x1a\x45\xdf\xa3")
 """Beginnings of sound files, which are no samples."""
 
 
 def pcm(source: IO[bytes], rate: int, read: Callable[[int, int], bytes] = os.read) -> Iterator[npt.NDArray[np.float32]]:
-    """Pieces (n,) of speech, full scale 1, as 16-bit mono samples (little endian) of ``rate`` come in.
+    """Pieces (n,) of speech, full scale 1, as 16-bit mono samples (little endian) of ``rate`` come in from a file.
 
-    Args:
-        source: a file with a descriptor.
-        rate: samples a second.
-        read: works as ``os.read``; half a sample at the end is dropped.
+    ``read`` works as ``os.read``; half a sample at the end is dropped.
     """
     rest, first = b"", True
     # A read of a pipe gives the bytes that are there, at least one, and nothing at its end.

@@ -15,24 +15,8 @@ WORDS = ("words", "word", "ort", "ort-mau")
 """How tiers of phones and of words are called, alone or after the speaker's name (``84 - phones``)."""
 
 SILENCES = {
-    "",
-    "sil",
-    "sp",
-    "spn",
-    "pau",
-    "silence",
-    "_",
-    "<eps>",
-    "<p>",
-    "<p:>",
-    "<p>:",
-    "<sil>",
-    "#",
-    "h#",
-    "epi",
-    "nsn",
-    "noise",
-    "laugh",
+    *("", "sil", "sp", "spn", "pau", "silence", "_", "<eps>", "<p>", "<p:>", "<p>:", "<sil>", "#", "h#", "epi"),
+    *("nsn", "noise", "laugh"),
 }
 """Labels of pauses."""
 
@@ -115,13 +99,7 @@ def _number(tokens: Iterator[re.Match[str]]) -> float:
 
 
 def write_text_grid(path: Path, tiers: Mapping[str, Sequence[Interval]], end: float) -> None:
-    """Write interval tiers in Praat's long text format; the times between intervals become empty ones.
-
-    Args:
-        path: the file.
-        tiers: intervals by name of the tier, in order of time.
-        end: in seconds.
-    """
+    """Write interval tiers by name, in order of time, in Praat's long text format; gaps become empty intervals."""
     span = ["xmin = 0", f"xmax = {end:.4f}"]
     lines = ['File type = "ooTextFile"', 'Object class = "TextGrid"', "", *span]
     lines += ["tiers? <exists>", f"size = {len(tiers)}", "item []:"]

@@ -19,7 +19,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, OptionError, needs_extra
+from facediff.errors import FaceDiffError, OptionError
 from facediff.registry import UnknownComponentError, voice_gate
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.hints import checks_arguments
@@ -276,46 +276,6 @@ def _forget(stretches: deque[tuple[int, float]], step: int) -> None:
     """Drop the stretches that are too long ago."""
     while stretches and stretches[0][0] < step - MEMORY:
         stretches.popleft()
-
-
-@voice_gate.register("webrtc")
-class WebRtcGate(VoiceGate):
-    """The voice activity detector of WebRTC, which knows the spectra of speech and of noise.
-
-    Args:
-        strictness: 0 takes most for speech, 3 least.
-        timing: options of :class:`VoiceGate`.
-    """
-
-    def __init__(self, *, strictness: Annotated[int, Range(0, 3)] = 2, **timing: Any) -> None:  # noqa: ANN401
-        super().__init__(**timing)
-        with needs_extra("webrtcvad", "voice", "the voice gate webrtc"):
-            import webrtcvad
-        self.strictness = strictness
-        self._make = webrtcvad.Vad
-
-    def listener(self) -> Listener:
-        """A detector at the beginning of a recording."""
-        return _WebRtcListener(self._make(self.strictness))
-
-
-class _WebRtcListener(Listener):
-    """Asks WebRTC's detector about every 10 ms."""
-
-    def __init__(self, detector: Any) -> None:  # noqa: ANN401 - a class of C
-        self._detector = detector
-
-    def hear(self, steps: npt.NDArray[np.float64]) -> list[bool]:
-        """Decide on each step."""
-        samples = np.clip(np.round(steps * 32767), -32768, 32767).astype("<i2")
-        # Its detector takes the faintest noise for speech where nothing else was heard before.
-        return [
-            bool(np.abs(step).max() > 10) and self._detector.is_speech(step.tobytes(), SAMPLE_RATE) for step in samples
-        ]
-
-    def finish(self) -> list[bool]:
-        """Nothing waits."""
-        return []
 
 
 @voice_gate.register("silero")

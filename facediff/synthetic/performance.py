@@ -70,31 +70,19 @@ class SpeakingHabits:
 
 @dataclass(frozen=True)
 class MoodEffect:
-    """The effect of a mood on every speaker's face and voice.
+    """The effect of a mood on every speaker's face and voice."""
 
-    Attributes:
-        articulation: gain of large shapes of the mouth.
-        brows: gain of the brows on accents, and of the nods.
-        raised: resting weight of the brows.
-        smile, frown: added to the resting weights.
-        droop: resting weight of the upper lids.
-        rate, pitch_range: factors of the voice's speed and of the range of its melody.
-        pitch: semitones added to the voice's mean pitch.
-        loudness: decibels added.
-        brightness: decibels per octave that the spectrum is tilted by above 500 Hz; a pressed voice is bright.
-    """
-
-    articulation: float
-    brows: float
-    raised: float
-    smile: float
+    articulation: float  # Gain of large shapes of the mouth
+    brows: float  # Gain of the brows on accents, and of the nods
+    raised: float  # Resting weight of the brows
+    smile: float  # Added to the resting weight, as the next one
     frown: float
-    droop: float
-    rate: float
-    pitch_range: float
-    pitch: float
-    loudness: float
-    brightness: float
+    droop: float  # Resting weight of the upper lids
+    rate: float  # Factor of the voice's speed
+    pitch_range: float  # Factor of the range of its melody
+    pitch: float  # Semitones added
+    loudness: float  # Decibels added
+    brightness: float  # Decibels per octave above 500 Hz; a pressed voice is bright
 
 
 # Acoustics after Banse and Scherer (J. Pers. Soc. Psychol. 70, 1996): sad and bored voices are slower, lower, softer

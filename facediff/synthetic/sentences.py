@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-# The 32 sentences were written for this corpus and are rich in p, b, m, rounded and open vowels.
-
 SENTENCES: tuple[str, ...] = (
     "Mama bought a map of Bombay for papa.",
     "Bob put both pumps above the purple boat.",

@@ -1,8 +1,5 @@
 """Tasks on a Dask cluster, for :func:`facediff.utils.jobs.run_tasks`: its client and its workers.
 
-A worker does one task at a time, in the client's working folder, on one processor, and loads a model once. Dask's nanny
-starts a worker again that a task has killed; a task that kills several of them fails alone.
-
 Dask runs anything that its clients send: a connection to a scheduler can run programs as the user of its workers. Use
 one that only its users reach, or TLS (``docs/cluster.md``).
 """

@@ -101,14 +101,11 @@ def run_tasks(
 ) -> Generator[tuple[Task, Any]]:
     """Do tasks in several workers, and yield each with its result as soon as it is done.
 
-    No worker gets a task before it is free for it, and at most one result for each worker waits to be taken. Wrap the
-    generator in :func:`contextlib.closing`: running tasks then have some seconds to come to their end when the loop
-    that takes the results ends. Workers ignore Ctrl-C; only this process reacts to it.
+    At most one result for each worker waits to be taken. Wrap the generator in :func:`contextlib.closing`: running
+    tasks then have some seconds to come to their end when the loop ends. Only this process reacts to Ctrl-C.
 
     Args:
-        work: does a task. For processes and clusters: a picklable function or object, which each worker gets once and
-            keeps, such as :class:`PerWorker`. A task may be done again if its worker is lost, so it writes its files
-            whole or not at all.
+        work: does a task; picklable, such as :class:`PerWorker`, and may do it again if a worker is lost.
         tasks: its arguments.
         workers: number of workers; as many as processors, or as the cluster has, if None. One works in this process.
         mode: kind of workers on this machine, each on one processor. Where processes cannot be started (programs read

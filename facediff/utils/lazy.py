@@ -17,10 +17,7 @@ def lazy_names(
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a package with names that are loaded on first use (PEP 562).
 
-    Args:
-        package: the package's ``__name__``.
-        modules: for each module of the package, its public names, separated by spaces.
-        packages: packages inside the package that are names of it themselves, separated by spaces.
+    They are public names of its modules, and packages inside it, each separated by spaces.
 
     Example:
         >>> __getattr__, __dir__, __all__ = lazy_names("facediff.mesh", {"mesh": "Mesh read_mesh"})

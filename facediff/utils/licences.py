@@ -87,12 +87,7 @@ def licence_metadata(licences: Iterable[Licence]) -> dict[str, str]:
 
 
 def known_licence(name: str) -> Commercial:
-    """Commercial use under a licence, by its usual identifier; unknown for any other.
-
-    Example:
-        >>> known_licence("Apache-2.0"), known_licence("cc-by-nc-4.0"), known_licence("ours")
-        ('allowed', 'forbidden', 'unknown')
-    """
+    """Commercial use under a licence, by its usual identifier; unknown for any other."""
     return KNOWN.get(name.lower(), "unknown")
 
 

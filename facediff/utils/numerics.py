@@ -39,15 +39,9 @@ def nearest_distances(points: Array, targets: Array, limit: float) -> Array:
 
 
 def solve_block_chain(diagonal: Array, coupling: Array, right: Array) -> Array:
-    """Solve a symmetric positive definite system of blocks that diagonal matrices couple to their neighbours.
+    """The solution (T, K) of a symmetric positive definite system for a right side (T, K).
 
-    Args:
-        diagonal: (T, K, K) the blocks on the diagonal.
-        coupling: (T − 1, K) the diagonals of the blocks next to it.
-        right: (T, K).
-
-    Returns:
-        the solution (T, K).
+    It has blocks (T, K, K) on the diagonal and diagonal blocks (T − 1, K) next to them.
     """
     frames, count = right.shape
     solution = np.array(right, np.float64)

@@ -50,7 +50,7 @@ def test_defaults_of_augmentations(name: str) -> None:
     assert promised.keys() == defaults(registry.augmentation.get(name)).keys()
 
 
-@pytest.mark.parametrize("name", ["energy", "webrtc"])
+@pytest.mark.parametrize("name", ["energy"])
 def test_defaults_of_voice_gates(name: str) -> None:
     promised = {
         option: text

@@ -40,10 +40,6 @@ def sentence_with_pauses(decibels: float, seed: int = 0) -> np.ndarray:
     return 0.1 * (speech + noise * 10 ** (-decibels / 20))
 
 
-SPOKEN = np.zeros(175, bool)
-SPOKEN[25:75] = SPOKEN[100:150] = True
-
-
 @pytest.mark.parametrize("decibels", [12, 20, 30, 50, 200])
 def test_mouth_rests_in_pauses_and_no_onset_is_cut(decibels: float) -> None:
     found = openness(sentence_with_pauses(decibels), 175, FRAMES, EnergyGate())
@@ -139,13 +135,12 @@ def silero_like(path: Path) -> Path:
 @functools.cache
 def gates() -> list[VoiceGate]:
     """All gates; Silero's with a network that takes every other sample for a voice."""
-    pytest.importorskip("webrtcvad")
     model = silero_like(Path(tempfile.mkdtemp()) / "vad.onnx")
     names = [name if name != "silero" else f"silero:model={model}" for name in voice_gate.names()]
     return [read_gate(name) for name in sorted(names, key=lambda name: "silero" in name)]  # type: ignore[misc]
 
 
-@given(cuts=st.lists(st.integers(1, 30_000), max_size=8), which=st.integers(0, 2))
+@given(cuts=st.lists(st.integers(1, 30_000), max_size=8), which=st.integers(0, 1))
 @settings(max_examples=15, deadline=None)
 def test_openness_does_not_depend_on_how_speech_is_cut(cuts: list[int], which: int) -> None:
     gate = gates()[which]
@@ -170,12 +165,6 @@ def test_what_comes_after_the_look_ahead_does_not_matter() -> None:
     np.testing.assert_array_equal(*made)
 
 
-def test_webrtc_gate_rests_in_silence() -> None:
-    found = openness(sentence_with_pauses(200), 175, FRAMES, gates()[1])
-    assert found[84:94].max() == 0
-    assert found[SPOKEN].mean() > 0.5
-
-
 @pytest.mark.parametrize(
     ("text", "named"),
     [
@@ -184,7 +173,6 @@ def test_webrtc_gate_rests_in_silence() -> None:
         ("energy:margin=x", "margin"),
         ("energy:margin=90", "margin"),
         ("energy:attack=0.4,lead=0.4", "lead"),
-        ("webrtc:strictness=4", "strictness"),
     ],
 )
 def test_impossible_gate_is_named(text: str, named: str) -> None:
