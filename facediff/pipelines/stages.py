@@ -247,7 +247,7 @@ class Denoise(Stage):
     def whole(self, take: Take) -> None:
         """Change the speech that the model hears."""
         if self.noise:
-            from facediff.speech.denoising import denoised
+            from facediff.speech.audio import denoised
 
             take.speech = denoised(take.speech)
         if self.semitones:

@@ -432,6 +432,16 @@ def fit_length(audio: npt.NDArray[np.float32], length: int) -> npt.NDArray[np.fl
     return np.pad(audio[:length], (0, max(0, length - len(audio))))
 
 
+def denoised(speech: Samples) -> Samples:
+    """Speech (S,) at 16 kHz without its steady noise, by spectral gating; silence stays silence."""
+    with needs_extra("noisereduce", "voice", "--denoise"):
+        import noisereduce
+    if not speech.any():
+        return speech
+    cleaned = noisereduce.reduce_noise(y=speech, sr=SAMPLE_RATE, stationary=True)
+    return fit_length(np.nan_to_num(np.asarray(cleaned, np.float32)), len(speech))
+
+
 def samples_for(frames: int, frame_rate: float) -> int:
     """Number of 16 kHz samples that span ``frames`` motion frames."""
     return round(frames * SAMPLE_RATE / frame_rate)

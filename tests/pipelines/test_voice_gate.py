@@ -70,7 +70,7 @@ def test_denoising_changes_what_is_heard_and_not_what_is_kept(model: facediff.An
     assert not np.array_equal(plain.vertices, clean.vertices)
     np.testing.assert_array_equal(plain.speech, clean.speech)
     assert clean.metadata["denoised"] == "yes"
-    from facediff.speech.denoising import denoised
+    from facediff.speech.audio import denoised
 
     quiet = slice(4000, 28_000)
     assert np.std(denoised(noisy)[quiet]) < 0.3 * np.std(noisy[quiet])
