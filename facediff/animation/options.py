@@ -159,7 +159,6 @@ class RecordingOptions(CheckedOptions):
         voice_shift: semitones by which the model receives pitch and formants shifted; -4 closes the lips better at p, b
             and m of some high voices (the file keeps the recording)
         alignment: when which phoneme is spoken, .TextGrid or .csv (start, end, ipa): the lips touch at each p, b and m
-        transcript: the English words that are spoken, from which these times are found
         closure_budget: mm that a vertex is moved by at most for that (default: 12)
     """
 
@@ -168,15 +167,12 @@ class RecordingOptions(CheckedOptions):
     denoise: bool = False
     voice_shift: Annotated[ranges.Semitones, Option(metavar="SEMITONES")] = 0.0
     alignment: Annotated[FilePath | None, Option(metavar="FILE", reads=True)] = None
-    transcript: Annotated[str | None, Option(metavar="TEXT")] = None
     closure_budget: Annotated[ranges.Millimetres | None, Option(metavar="MM")] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.alignment is not None and self.transcript is not None:
-            raise OptionError("alignment", "says when what is spoken, as {transcript} does; give one of them")
-        if self.closure_budget is not None and self.alignment is None and self.transcript is None:
-            raise OptionError("closure_budget", "has no effect without {alignment} or {transcript}; give one of them")
+        if self.closure_budget is not None and self.alignment is None:
+            raise OptionError("closure_budget", "has no effect without {alignment}; give it as well")
 
 
 @dataclass(frozen=True)
@@ -486,7 +482,6 @@ class RecordingKeywords(StreamKeywords, ControlKeywords, total=False):
     denoise: bool
     voice_shift: float
     alignment: FilePath | None
-    transcript: str | None
     closure_budget: float | None
     target_mesh: FilePath | None
     correspondence: FilePath | None

@@ -112,8 +112,7 @@ def animate(
     if stream:
         refuse_idle("is for recordings, and a stream ends by itself", max_seconds=recording.max_seconds is not None)
     if is_batch:
-        one = ("alignment", "transcript")
-        refuse_idle("is for one recording", **{name: getattr(recording, name) is not None for name in one})
+        refuse_idle("is for one recording", alignment=recording.alignment is not None)
     else:
         refuse_idle("is for several recordings or a folder of them", **changed(batch))
     checkpoint = model_or_bundled(checkpoint)

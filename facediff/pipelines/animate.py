@@ -165,8 +165,8 @@ class AnimationPipeline(ABC):
 
             self.act = Act(read_acting(options.acting), self.frame_rate, options.controls_seed)
         self.lips: CloseLips | None = None
-        if options.alignment is not None or options.transcript is not None:
-            self.lips = CloseLips(options.alignment, options.transcript, options.closure_budget)
+        if options.alignment is not None:
+            self.lips = CloseLips(options.alignment, options.closure_budget)
         self.retarget: Retarget | None = None
         if options.target_mesh is not None:
             file = None if options.correspondence is None else Path(options.correspondence)

@@ -363,7 +363,6 @@ class Animator:
             refuse_idle(
                 "is for one recording",
                 alignment=settings.alignment is not None,
-                transcript=settings.transcript is not None,
                 name=name is not None,
             )
         from facediff.speech.audio import speech_of

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from facediff.editing.fit_check import FitReport
     from facediff.spaces.decoding import ChannelDecoder
     from facediff.speech.audio import SpeechRecording
-    from facediff.speech.phonemes import TimedPhoneme
     from facediff.speech.voice_activity import MouthAtRest
 
 Array = npt.NDArray[np.float32]
@@ -391,28 +390,18 @@ class Decode(Stage):
 
 
 class CloseLips(Stage):
-    """Lips touch where the phonemes of an alignment or a transcript have them touch."""
+    """Lips touch where the phonemes of an alignment have them touch."""
 
-    def __init__(self, alignment: str | Path | None, transcript: str | None, budget: float | None) -> None:
-        self.alignment, self.transcript, self.budget = alignment, transcript, budget
-
-    def phonemes(self, speech: Array) -> list[TimedPhoneme]:
-        """The phonemes of speech (S,), with their times."""
-        from facediff.speech.phonemes import read_alignment
-
-        if self.alignment is not None:
-            return read_alignment(Path(self.alignment))
-        from facediff.editing.transcripts import align_transcript
-
-        return align_transcript(str(self.transcript), speech)
+    def __init__(self, alignment: str | Path, budget: float | None) -> None:
+        self.alignment, self.budget = Path(alignment), budget
 
     def whole(self, take: Take) -> None:
         """Learn from all frames how the face opens its mouth, and close it."""
         from facediff.animation.animation import PHONEMES
         from facediff.editing.controls.closures import BUDGET, close_lips
-        from facediff.speech.phonemes import closed_times, phonemes_text
+        from facediff.speech.phonemes import closed_times, phonemes_text, read_alignment
 
-        phonemes = self.phonemes(take.recording.speech)
+        phonemes = read_alignment(self.alignment)
         for sample in take.samples:
             budget = BUDGET if self.budget is None else self.budget
             closed = close_lips(sample.animation(), closed_times(phonemes), budget)

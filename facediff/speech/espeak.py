@@ -97,7 +97,7 @@ def speak(text: str, voice: EspeakVoice) -> Utterance:
 
 def _paths() -> tuple[str, str]:
     """Find the library and its data."""
-    with needs_extra("espeakng_loader", "puppet", "speech by espeak-ng (corpus, --transcript)"):
+    with needs_extra("espeakng_loader", "puppet", "speech by espeak-ng"):
         import espeakng_loader
     return str(espeakng_loader.get_library_path()), str(espeakng_loader.get_data_path())
 

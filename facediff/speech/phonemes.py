@@ -9,24 +9,13 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from facediff.errors import counted, damaged, note
 from facediff.speech.text_grids import SILENCES, phones_in
 from facediff.utils.paths import find_file
 from facediff.utils.plain_files import read_rows
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
 STRESS = "ˈˌ"
-
-OTHER_PACE = 2.5
-"""A text that a machine speaks so many times faster or slower than it was recorded is another recording's."""
-
-MOST_CHARACTERS = 2000
-"""Of a transcript; a longer recording is better aligned by a program made for it."""
 
 
 @dataclass(frozen=True)
@@ -141,16 +130,6 @@ def closures(phonemes: Sequence[TimedPhoneme], frame_rate: float) -> list[tuple[
         else:
             frames.append((start, end))
     return frames
-
-
-def spoken_by_machine(text: str) -> tuple[npt.NDArray[np.float32], list[TimedPhoneme]]:
-    """An English text as espeak-ng speaks it, (S,) at 16 kHz, with the times of its phonemes but for pauses."""
-    from facediff.speech.espeak import EspeakVoice, speak
-
-    utterance = speak(" ".join(text.split()), EspeakVoice("en-us", rate=165, pitch=50, pitch_range=50))
-    return utterance.samples, [
-        TimedPhoneme(phoneme.start, phoneme.end, phoneme.ipa) for phoneme in utterance.phonemes if phoneme.ipa
-    ]
 
 
 def read_alignment(path: Path) -> list[TimedPhoneme]:

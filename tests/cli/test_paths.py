@@ -26,7 +26,7 @@ NO_PATHS = (
     "accelerator acting augmentation audio_encoder baseline by clip clips condition corpus dataset device "
     "expressiveness expressivity face file_unit font guidance host identities identity kind labels languages layout "
     "licence license metric microphone name option output_unit part pattern phonemes protocol push region sampler "
-    "scalar scheduler sound split splits subjects suffix to topology transcript truth_layout truth_pattern unit "
+    "scalar scheduler sound split splits subjects suffix to topology truth_layout truth_pattern unit "
     "voice_gate"
 )
 """Texts that are no paths; a new option of type text either joins them or declares that it is read or written."""
