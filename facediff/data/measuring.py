@@ -161,8 +161,6 @@ def _measured(
         except Exception as error:
             measured, failure = f"the first process failed: {error!r}", error
     measured = trainer.strategy.broadcast(measured, src=0)
-    if failure is not None:
-        raise failure
     if isinstance(measured, str):
-        raise FaceDiffError(measured)
+        raise failure or FaceDiffError(measured)
     return measured

@@ -62,8 +62,6 @@ class ParametricDataModule(SpeechMotionDataModule):
         folder = Path(root).expanduser()
         if is_packed(root):  # is refused when it is read
             return
-        if not folder.exists():
-            raise cls.missing(folder)
         if not cls.speakers_in(folder):
             expected = f"{' or '.join(cls.suffixes)}, each with a .wav of its name"
             raise FaceDiffError(

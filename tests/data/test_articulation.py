@@ -76,18 +76,6 @@ def test_area_under_curve_is_the_share_of_pairs() -> None:
     assert area_under_curve(high, low) == pytest.approx(np.mean(pairs))
 
 
-def test_speakers_count_alike_and_their_interval_holds_the_mean() -> None:
-    found = by_speaker({"a": [motion()] * 5, "b": [motion(0.5)], "c": [motion(0.8)]})
-    mean, interval = found["open_vowels"]
-    assert mean == pytest.approx(8.0 * 2.3 / 3)
-    assert interval is not None
-    assert interval.low < mean < interval.high
-    assert interval.low >= 4.0
-    assert interval.high <= 8.0
-    assert by_speaker({"a": [motion()]})["open_vowels"] == (pytest.approx(8.0), None)
-    assert "contact" not in found
-
-
 def test_curves_of_vertices_are_in_millimetres_beyond_rest() -> None:
     """Upper and lower lips at three places; the outermost pair is the corners."""
     rest = np.array([[-20, 1, 0], [0, 1, 0], [20, 1, 0], [-20, 0, 0], [0, 0, 0], [20, 0, 0]], float)

@@ -29,7 +29,7 @@ from facediff.data.packed.layout import (
     Record,
 )
 from facediff.data.packed.shards import ShardedArray, chunks_of
-from facediff.data.packed.stores import ByteStore, LocalStore, open_store
+from facediff.data.packed.stores import ByteStore, LocalStore, open_store, runs
 from facediff.data.storage import refuse_out_of_range, within
 from facediff.errors import FaceDiffError, damaged
 from facediff.speech.audio import fit_length, open_sound, read_speech, to_speech
@@ -219,9 +219,10 @@ class PackedMotion:
                 tasks.append((number, chunk))
         # Neighbouring chunks are fetched together: in a store at an address each request costs a round trip.
         with damaged(f"clip {self.clip.name}", REMEDY):
-            for run in _consecutive(to_fetch):
-                fetched = self.array.fetch(self._begin + run[0], self._begin + run[-1] + 1)
-                tasks += zip(run, fetched, strict=True)
+            for run in runs([(number, 1) for number in to_fetch]):
+                first, stop = run[0][0], sum(run[-1])
+                fetched = self.array.fetch(self._begin + first, self._begin + stop)
+                tasks += zip(range(first, stop), fetched, strict=True)
 
             def write(task: tuple[int, npt.NDArray[Any] | memoryview]) -> None:
                 number, chunk = task
@@ -284,17 +285,6 @@ class PackedMotion:
             first = number * info.chunk
             rows[first : first + info.chunk] = chunk[: self.frames - first]
         return rows.view(np.dtype(self.clip.coding)).reshape(self.frames, -1, 3)
-
-
-def _consecutive(numbers: Sequence[int]) -> list[list[int]]:
-    """Groups of consecutive numbers."""
-    groups: list[list[int]] = []
-    for number in numbers:
-        if groups and groups[-1][-1] == number - 1:
-            groups[-1].append(number)
-        else:
-            groups.append([number])
-    return groups
 
 
 def _pieces(sound: PackedSound, first: int, stop: int) -> list[tuple[int, int, int]]:

@@ -40,6 +40,7 @@ NEUTRAL_SHARE = 0.05  # share of the frames that the neutral face is the median 
 CLOSED = 0.012  # gap of closed lips as a share of the face's size, about 1 mm
 CLOSED_SHARE = 1 / 3  # of the frames with closed lips
 NEUTRAL_FRAMES = (5, 50)  # at least and at most so many
+LISTED = 10  # frames that the report names
 FLAME_FRAMES = 64  # frames that the FLAME layer works on at a time
 
 
@@ -271,7 +272,8 @@ def choose_neutral(
     frames = neutral_frames(loudness(speech, covered, frame_rate), stabilised.speed[:covered], gaps, closed).tolist()
     face = np.median(stabilised.frames[frames], axis=0).astype(np.float64)
     mouth = "" if gaps is None else ", with the mouth closed,"
-    source = f"median of {len(frames)} silent and still frames{mouth} (counted from 0): {spans(frames)}"
+    listed = ", ".join([*map(str, frames[:LISTED]), *(["…"] if len(frames) > LISTED else [])])
+    source = f"median of {len(frames)} silent and still frames{mouth} (counted from 0): {listed}"
     return NeutralFace(face, unmoved, source, frames)
 
 
@@ -321,19 +323,3 @@ def neutral_frames(loud: Array, speed: Array, gaps: Array | None = None, closed:
     share = NEUTRAL_SHARE if gaps is None else CLOSED_SHARE
     count = min(len(frames), int(np.clip(round(share * len(frames)), *NEUTRAL_FRAMES)))
     return np.sort(frames[np.argsort(ranks, kind="stable")[:count]])
-
-
-def spans(numbers: list[int]) -> str:
-    """Sorted whole numbers in short: ``3-7, 12``; an ellipsis after ten spans.
-
-    >>> spans([3, 4, 5, 12])
-    '3-5, 12'
-    """
-    parts: list[list[int]] = []
-    for number in numbers:
-        if parts and number == parts[-1][1] + 1:
-            parts[-1][1] = number
-        else:
-            parts.append([number, number])
-    texts = [str(a) if a == b else f"{a}-{b}" for a, b in parts]
-    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], "…"])
