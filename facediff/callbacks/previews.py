@@ -6,8 +6,10 @@ show it.
 
 from __future__ import annotations
 
+import itertools
 import time
 import warnings
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -261,12 +263,8 @@ def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> I
 
 def first_of_each_identity(clips: Sequence[Clip], count: int) -> list[str]:
     """Names of ``count`` clips (fewer if there are no more): each identity's first, then each one's second …."""
-    rounds: dict[str, int] = {}
-    order = []
-    for index, clip in enumerate(clips):
-        rounds[clip.identity] = rounds.get(clip.identity, 0) + 1
-        order.append((rounds[clip.identity], index, clip.name))
-    return [name for _, _, name in sorted(order)[:count]]
+    rounds: dict[str, Iterator[int]] = defaultdict(itertools.count)
+    return [clip.name for clip in sorted(clips, key=lambda clip: next(rounds[clip.identity]))[:count]]
 
 
 def default_error_scale(samples: Sequence[Sample]) -> float:

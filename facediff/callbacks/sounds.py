@@ -54,7 +54,7 @@ class SpokenSoundsTerm(Callback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Read the recordings."""
-        data = getattr(trainer, "datamodule", None)
+        data = trainer.datamodule  # type: ignore[attr-defined]
         if trainer.world_size > 1 or trainer.precision == "16-mixed":
             raise FaceDiffError(
                 "SpokenSoundsTerm: its gradient is neither shared between processes nor scaled; train with one "

@@ -233,12 +233,7 @@ def fault_of(option: str, name: str) -> str:
 def subclasses(kind: registry.Kind) -> set[str]:
     """Names of the imported classes that extend a base of the registered ones."""
     bases = {base for entry in kind for base in entry.implementation.__mro__ if base.__module__.startswith("facediff.")}
-    cls: type
-    names: set[str] = set()
-    for base in bases:
-        for cls in base.__subclasses__():
-            names.add(cls.__name__)
-    return names
+    return {cls.__name__ for base in bases for cls in type.__subclasses__(base)}
 
 
 def import_fault(option: str, path: str) -> str:

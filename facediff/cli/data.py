@@ -13,14 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from facediff.cli.options import (
-    Corpus,
-    File,
-    FileOrList,
-    FrameRate,
-    OutputFolder,
-    WorkOptions,
-)
+from facediff.cli.options import Corpus, File, FileOrList, FrameRate, OutputFolder, WorkOptions
 from facediff.cli.parsing import Parameters, parameters_of, parse
 from facediff.cli.process import tell
 from facediff.data import prepare as prepare_package

@@ -142,6 +142,9 @@ def evaluate(
     clips = sum(1 for path in truth.iterdir() if path.suffix in (".npy", ".npz", ".csv", ".json"))
     seconds = DRAW_SECONDS * scores.bootstrap * clips * (2 * len(methods) - 1) * len(protocols)
     confirm_cost(yes, "--bootstrap", seconds=seconds)
+    options = {name: getattr(files, name) for name in ("frame_rate", "unit", "file_unit", "identity", "truth_stride")}
+    options |= {name: getattr(scores, name) for name in ("bootstrap", "level", "seed")}
+    options |= {"workers": work.workers, "scheduler": work.scheduler, "progress": not work.quiet}
     report = score(
         methods,
         truth,
@@ -149,18 +152,8 @@ def evaluate(
         metrics=scores.metric or [],
         corpus=corpus,
         by=scores.by or (),
-        frame_rate=files.frame_rate,
         files=parameters,
-        unit=files.unit,
-        file_unit=files.file_unit,
-        identity=files.identity,
-        truth_stride=files.truth_stride,
-        bootstrap=scores.bootstrap,
-        level=scores.level,
-        seed=scores.seed,
-        workers=work.workers,
-        scheduler=work.scheduler,
-        progress=not work.quiet,
+        **options,
         **faces_of(truth, corpus, parameters, scores, files),
     )
     write(report, json, csv)

@@ -99,7 +99,8 @@ def live_model(options: AnimationOptions) -> LiveModel:
     if pipeline.rest is not None and pipeline.gate == USUAL_GATE:
         pipeline.rest.mouth.gate = read_gate(usual_gate(pipeline.stream_timing[0])) or pipeline.rest.mouth.gate
     pipeline.stream()  # refuses options that cannot be streamed, before anything is opened
-    face, channels = pipeline.facts, pipeline.gives_channels
+    face = pipeline.facts
+    channels = pipeline.decoder is not None and pipeline.face is None  # controls change vertices
     return LiveModel(
         start=partial(pipeline.stream, channels=channels),
         frame_rate=pipeline.frame_rate,
@@ -107,7 +108,7 @@ def live_model(options: AnimationOptions) -> LiveModel:
         faces=np.zeros((0, 3), np.int32) if face["faces"] is None else face["faces"],
         unit=face["unit"],
         look_ahead=pipeline.look_ahead,
-        hop=pipeline.hop,
+        hop=pipeline.stream_timing[1],
         colours=face.get("colours"),
         decoder=pipeline.decoder if channels else None,
         metadata={name: text for name, text in pipeline.metadata(pipeline.seed).items() if text},

@@ -113,8 +113,10 @@ class AnimationPipeline(ABC):
         gate: the voice gate's name with its options.
         progress: called while motion is generated; None for a bar on the terminal, if the options ask for one.
         channels: the stage that finds channels of finished vertices, of a model that has such.
+        corpus: name of the model's faces in errors; set before this constructor is called.
     """
 
+    corpus: str
     style_name = ""
     """Name of the style of the latest motion."""
     channels: Stage | None = None
@@ -213,11 +215,6 @@ class AnimationPipeline(ABC):
         return max(self.windows.look_ahead, plan.look_ahead / self.frame_rate), plan.hop / self.frame_rate
 
     @property
-    def hop(self) -> float:
-        """Seconds from one window of a stream to the next."""
-        return self.stream_timing[1]
-
-    @property
     def has_weights(self) -> bool:
         """Whether animations have weights of ARKit's shapes, or are of the built-in face, which has such shapes."""
         if self.decoder is not None and self.decoder.space.kind == "arkit":
@@ -230,11 +227,6 @@ class AnimationPipeline(ABC):
         from facediff.editing.blendshapes import is_built_in_face
 
         return is_built_in_face(len(self.facts["template"]), self.facts.get("faces"))
-
-    @property
-    @abstractmethod
-    def corpus(self) -> str:
-        """Name of the model's faces in errors."""
 
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on."""
@@ -331,11 +323,6 @@ class AnimationPipeline(ABC):
         stages = [stage for stage in self.stages if not (plain and isinstance(stage, Decode | Direct))]
         steps = [stage.stream(self.seed) for stage in stages]
         return AnimationStream(self.generator(self.seed), [step for step in steps if step is not None], rate)
-
-    @property
-    def gives_channels(self) -> bool:
-        """Whether a stream's channels say all of its motion: controls change vertices."""
-        return self.decoder is not None and self.face is None
 
     @property
     def look_ahead(self) -> float:

@@ -67,6 +67,7 @@ class Audio2FacePipeline(AnimationPipeline):
         self.model = Audio2Face.open(options.checkpoint, threads=options.threads) if model is None else model
         folder = self.model.folder
         self.actor = folder.facts.actor or "actor"
+        self.corpus = f"Audio2Face-3D's {self.actor}"
         if options.commercial_only:
             require_cleared(options.checkpoint, licences_of(self.model))
         refuse_idle(
@@ -107,11 +108,6 @@ class Audio2FacePipeline(AnimationPipeline):
         """Whether the folder has blendshapes under ARKit's names."""
         poses = self.model.folder.poses
         return "skin" in poses and {*poses["skin"].names} <= {*ARKIT}
-
-    @property
-    def corpus(self) -> str:
-        """Name of the model's face in errors."""
-        return f"Audio2Face-3D's {self.actor}"
 
     def frames_of(self, samples: int) -> int:
         """How many frames there are for so many samples of speech."""

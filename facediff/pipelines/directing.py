@@ -47,10 +47,12 @@ def plan_runs(
     style_template: str | Path | None = None,
 ) -> list[StyledRun]:
     """One run for each style in the keys; one with ``style`` where they name none."""
-    for name in ENDED if direction is not None else ():
+    if direction is None:
+        return [StyledRun(style)]
+    for name in ENDED:
         if direction.under(name):
             raise FaceDiffError(f"{direction.source}: channel {name}: follows no keys any more; give --{name} instead")
-    if direction is None or (keys := direction.channels.get("style")) is None:
+    if (keys := direction.channels.get("style")) is None:
         return [StyledRun(style)]
     with located(f"{direction.source}: channel style"):
         texts = dict.fromkeys(str(key.value) for key in keys)

@@ -30,6 +30,7 @@ class ExportedPipeline(AnimationPipeline):
         refuse_idle("is fixed in an exported model", **{name: name in fixed for name in FIXED})
         self.model = copy(RuntimeModel.open(options.checkpoint, threads=options.threads) if model is None else model)
         about = self.model.description
+        self.corpus = f"the exported model's corpus {about.corpus}"
         if options.commercial_only and about.licences.get("commercial_use") != "allowed":
             raise OptionError("commercial_only", f"{about.model} is not cleared for commercial use; omit the option")
         if options.low_latency:
@@ -63,11 +64,6 @@ class ExportedPipeline(AnimationPipeline):
             rest_weights=lambda: self.model.arrays["rest_weights"][stream.face],
             decoder=self.model.decoder(stream.face),
         )
-
-    @property
-    def corpus(self) -> str:
-        """Name of the model's faces in errors."""
-        return f"the exported model's corpus {self.model.description.corpus}"
 
     def frames_of(self, samples: int) -> int:
         """How many frames the model gives for so many samples of speech."""

@@ -35,7 +35,7 @@ def animate_stream(options: AnimationOptions, output: Path, export: ExportOption
         stream = pipeline.stream(rate)
         report(
             f"ready; look-ahead {pipeline.look_ahead:.2f} s and the time that a window takes; "
-            f"{round(pipeline.hop * pipeline.frame_rate)} frames at a time, {pipeline.frame_rate:g} a "
+            f"{round(pipeline.stream_timing[1] * pipeline.frame_rate)} frames at a time, {pipeline.frame_rate:g} a "
             f"second, {len(template)} vertices; reading {rate} Hz, 16 bit"
         )
         for samples in pcm(sys.stdin.buffer, rate, read):

@@ -77,6 +77,7 @@ class TrainedPipeline(AnimationPipeline):
         self.identity = options.identity or model.identities[0]
         model.check_condition(options.condition)
         assets = self.assets = with_rig(model.assets)
+        self.corpus = f"the checkpoint's corpus {assets.corpus}"
         face = facts_of(assets.mesh, self.identity)
         self.options, self.facts = options, face
         if options.expressivity is not None:
@@ -104,11 +105,6 @@ class TrainedPipeline(AnimationPipeline):
         )
         steps = getattr(getattr(model, "sampler", None), "steps", 1)
         self.step_seconds *= steps * len(self.runs)
-
-    @property
-    def corpus(self) -> str:
-        """Name of the model's faces in errors."""
-        return f"the checkpoint's corpus {self.model.assets.corpus}"
 
     def direct(self, direction: Direction | None) -> None:
         """Follow other keys over time from now on."""
