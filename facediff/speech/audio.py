@@ -1,8 +1,7 @@
 """Reading speech, in every form that Python and the command line give it in, as samples (S,) at 16 kHz.
 
-From top to bottom: files of any common format, rate and number of channels; stretches of a corpus's files; recordings
-to animate, which keep their own sound, with :func:`speech_of` for arrays and files in Python; pieces of a stream;
-and whether a file is whole. Nothing here needs PyTorch.
+From top to bottom: files; stretches of a corpus's files; recordings to animate; pieces of a stream; and whether a file
+is whole.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The melody of speech: its pitch, and where it has accents, stressed syllables and the ends of phrases.
 
-From top to bottom: the pitch of a piece of speech; :class:`ProsodyTracker`, which finds the events of a recording or a
-stream. Every decision waits for the same short time, so that both give the same events.
+Every decision waits for the same short time, so that recordings and streams give the same events.
 """
 
 from __future__ import annotations

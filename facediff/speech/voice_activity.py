@@ -1,8 +1,7 @@
 """When a recording has speech, and how far a mouth may therefore be open in each frame.
 
-From top to bottom: the detectors, which are registered under the kind ``voice_gate`` and say for every 10 ms whether
-there is speech; :class:`Openness`, which makes of that a smooth number for every motion frame, in whole recordings and
-in streams alike; and faults of recordings (:func:`speech_problems`).
+Detectors, registered as ``voice_gate``, say for every 10 ms whether there is speech; :class:`Openness` makes of that a
+smooth number for every motion frame, in recordings and in streams alike.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Speech over time: the frames that a model gives for it, sliding windows over long speech, and the loop over them.
-
-Nothing here knows a model or PyTorch: :class:`SpeechWindows` is the loop of a model's
-:class:`~facediff.models.inference.SpeechStream` and of the runtime's stream.
-"""
+"""Speech over time: the frames that a model gives for it, sliding windows over long speech, and the loop over them."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 """The speakers of the built-in corpus: a face, a complexion, a voice and habits each.
 
-The ten of :data:`CAST` are written down; further speakers are drawn from the space of people that the seen ones span,
-so that a model meets many. Voices are espeak-ng's, which pip installs; drawn speakers take turns with voices made from
-recordings of people where these are asked for.
+The ten of :data:`CAST` are written down; further ones are drawn from the space of people that the seen ones span.
 """
 
 from __future__ import annotations

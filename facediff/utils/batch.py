@@ -144,7 +144,7 @@ def _attempt(
 
 
 def _is_full(error: BaseException | None) -> bool:
-    """Whether there was no room, in however many errors that is told."""
+    """Whether there was no room."""
     return error is not None and (getattr(error, "errno", None) in NO_SPACE or _is_full(error.__cause__))
 
 

@@ -1,8 +1,6 @@
-"""Where a model comes from: a checkpoint, a model folder, or the Hugging Face hub, from which it is fetched.
+"""Where a model comes from: a checkpoint, a model folder, or the Hugging Face hub, through ``huggingface_hub``.
 
-Importing this costs nothing, so that commands can refuse a name at once. Fetched folders are kept in the hub's own
-cache (``HF_HOME``), where they are found again without network; ``HF_HUB_OFFLINE`` and ``HF_ENDPOINT`` mean the
-same as to ``huggingface_hub``, through which everything goes.
+Importing this costs nothing, so that commands can refuse a name at once.
 """
 
 from __future__ import annotations

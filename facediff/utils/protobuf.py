@@ -9,12 +9,7 @@ Content = bytes | mmap.mmap
 
 
 def parts(message: bytes) -> Iterator[tuple[int, bytes]]:
-    """Number and content of each field in their order; :func:`whole_number` reads numbers of variable length.
-
-    Example:
-        >>> [(number, list(content)) for number, content in parts(bytes([8, 1, 18, 2, 104, 105]))]
-        [(1, [1]), (2, [104, 105])]
-    """
+    """Number and content of each field in their order; :func:`whole_number` reads numbers of variable length."""
     return ((number, message[start:end]) for number, start, end in fields(message, 0, len(message)))
 
 

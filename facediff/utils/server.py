@@ -175,7 +175,7 @@ def run_server(
 def listen(host: str, port: int) -> socket.socket:
     """A socket that others connect to."""
     family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    return socket.create_server(address, family=family, backlog=512)  # type: ignore[arg-type]
+    return socket.create_server(address, family=family, backlog=512)
 
 
 def make_server(config: uvicorn.Config, ready: Callable[[], object]) -> uvicorn.Server:

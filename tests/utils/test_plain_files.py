@@ -47,22 +47,8 @@ def test_json_of_every_unicode_encoding_is_read(encoding: str) -> None:
     assert parse_json(text.encode(encoding), "here") == expected
 
 
-NAMES = [
-    "=cmd()",
-    "+1",
-    "-2+3",
-    "-clip",
-    "@SUM(A1)",
-    "\t=1",
-    "\r=1",
-    " =1",
-    "'=1",
-    "''=1",
-    "'plain",
-    "plain",
-    "-0.5",
-    "\uff1d1",
-]
+NAMES = ["=cmd()", "+1", "-2+3", "-clip", "@SUM(A1)", "\t=1", "\r=1", " =1", "'=1", "''=1", "'plain", "plain", "-0.5"]
+NAMES += ["\uff1d1"]
 
 
 def test_names_in_tables_are_no_formulas_and_are_read_back(tmp_path: Path) -> None:
