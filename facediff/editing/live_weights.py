@@ -67,7 +67,6 @@ class FrameSolver:
         self._projection = np.ascontiguousarray(
             terms.projection.reshape(len(matrix), -1, 3)[:, moved].reshape(len(matrix), -1)
         )
-        self._all = len(self._used) == len(rest)
         self.reset()
 
     def reset(self) -> None:
@@ -77,8 +76,7 @@ class FrameSolver:
 
     def solve(self, offsets: Floats) -> Array:
         """The weights (K,) of the next frame, with offsets (V, 3) from the neutral face; in the order of the names."""
-        moving = offsets if self._all else offsets[self._used]
-        right = self._projection @ moving.reshape(-1).astype(np.float64)
+        right = self._projection @ offsets[self._used].reshape(-1).astype(np.float64)
         if not np.isfinite(right).all():
             raise FaceDiffError("frame: holds NaN or infinity; generate the motion again")
         right += self._coupling * self._last
