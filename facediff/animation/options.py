@@ -105,8 +105,7 @@ class GenerationOptions(CheckedOptions):
         steps: denoising steps of the sampler
         expressivity: 0 for the predicted mean, 1 for a sample, up to 2 for more than that; or by
             region, lips=0.5,upper_face=1.2 (default: the checkpoint's, usually 1)
-        guidance: follow conditions more than the model would by itself, style=1.5,speech=1.2,identity=1.3, where it was
-            trained for that (default: the checkpoint's, usually 1)
+        guidance: scales of DiffPoseTalk's guidance, audio=1.3,style=2 (default: the checkpoint's)
         seed: seed of the noise; equal seeds give equal motion
         voice_gate: what finds the pauses, in which the mouth comes to rest: energy or silero, with options
             (energy:release=0.3); off for the model's own motion there (default: energy, but off for imported models)

@@ -76,8 +76,8 @@ REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--tr
 """Options that may be repeated, since they add to earlier ones; prefixes."""
 
 FREE = (
-    *("sampler", "sampling_space", "expressivity", "speech_guidance", "identity_guidance", "style_guidance"),
-    *("unseen_identity", "protocol", "metrics", "validation_samples", "test_samples", "score_by"),
+    *("sampler", "sampling_space", "expressivity", "unseen_identity", "protocol", "metrics"),
+    *("validation_samples", "test_samples", "score_by"),
 )
 """Constructor arguments of a model that may differ from its checkpoint's; no weights depend on them."""
 

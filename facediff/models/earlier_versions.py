@@ -20,6 +20,7 @@ REMOVED: dict[str, dict[str, Any]] = {
         "invented_gain": 0.1,
         "face_weight_unit": "scaled",
         "style_contrast_weight": 0.0,
+        **{"speech_dropout": 0.0, "speech_guidance": 1.0, "identity_guidance": 1.0, "style_guidance": 1.0},
     },
     "facediff.models.style_content.model.StyleContentDisentanglement": {
         "basis_start": "pca",

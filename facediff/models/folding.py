@@ -170,11 +170,9 @@ class ConditionalDenoiser:
 
     Args:
         network: predicts clean motion.
-        conditions: its conditions, with everything else that is constant over the denoising steps. Under
-            guidance, all clips with their conditions, then all clips with some of them hidden, and so on.
+        conditions: its conditions, with everything else that is constant over the denoising steps.
         fold: the products of the network's ends, to run in their width; None to run on the vertices.
         blend: changes the features that the network gives in every step.
-        shares: what each of these predictions contributes to the guided one; they add up to one.
     """
 
     def __init__(
@@ -183,7 +181,6 @@ class ConditionalDenoiser:
         conditions: object,
         fold: Fold | None = None,
         blend: Blend = unchanged,
-        shares: Sequence[float] = (1.0,),
     ) -> None:
         self.network = network
         self.conditions = conditions
@@ -194,22 +191,11 @@ class ConditionalDenoiser:
             self.space = FoldedSpace(network.embed, fold)
         self.width = self.space.width
         self.blend = blend
-        self.shares = shares
         self._last: tuple[Tensor, Tensor] | None = None  # features and prediction of the latest step, if folded
 
     def features(self, embedded: Frames, step: Step) -> Frames:
-        """The network's last features of embedded noisy motion, guided, at a step counted from 0."""
-        views = len(self.shares)
-        # All conditional and unconditional predictions in one call of the network.
-        rows = embedded if views == 1 else embedded.repeat(views, 1, 1)
-        steps = step_of_rows(step, rows)
-        features = self.network.core(rows, steps, self.conditions)
-        if views == 1:
-            return features
-        # A combination of features is the same one of predictions, since the last map is affine and the shares add up
-        # to one. In 16 bits, a large difference of near numbers would be mostly rounding.
-        wide = features.to(torch.promote_types(features.dtype, torch.float32))
-        return torch.stack([share * part for share, part in zip(self.shares, wide.chunk(views), strict=True)]).sum(0)
+        """The network's last features of embedded noisy motion, at a step counted from 0."""
+        return self.network.core(embedded, step_of_rows(step, embedded), self.conditions)
 
     def noise(self, unit: State) -> State:
         """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
@@ -246,7 +232,6 @@ class PreconditionedDenoiser(ConditionalDenoiser):
         preconditioning: the scales around the network.
         mask: True on valid frames, one row for each row of the state.
         blend: changes the predictions of every step.
-        shares: as :class:`ConditionalDenoiser` takes them.
     """
 
     def __init__(
@@ -256,9 +241,8 @@ class PreconditionedDenoiser(ConditionalDenoiser):
         preconditioning: Preconditioning,
         mask: Bool[Tensor, "batch frames"],
         blend: Blend = unchanged,
-        shares: Sequence[float] = (1.0,),
     ) -> None:
-        super().__init__(network, conditions, None, blend, shares)
+        super().__init__(network, conditions, None, blend)
         self.preconditioning = preconditioning
         self.mask = mask
 

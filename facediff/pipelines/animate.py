@@ -367,8 +367,8 @@ def read_scales(guidance: Scales | None) -> dict[str, float]:
     """Scales of guidance by condition; empty for None.
 
     Example:
-        >>> read_scales("style=1.5,speech=1.2")
-        {'style': 1.5, 'speech': 1.2}
+        >>> read_scales("style=1.5,audio=1.2")
+        {'style': 1.5, 'audio': 1.2}
     """
     scales: dict[str, float] = {}
     if guidance is None:
@@ -379,7 +379,7 @@ def read_scales(guidance: Scales | None) -> dict[str, float]:
         if not equals or not name.strip() or name.strip() in scales:
             raise OptionError(
                 "guidance",
-                "expected each condition once with its scale, such as style=1.5,speech=1.2",
+                "expected each condition once with its scale, such as style=1.5,audio=1.2",
                 hints.shown(text),
             )
         scales[name.strip()] = ranges.GUIDANCE_SCALE.read(f"{{guidance}}: {name.strip()}", number.strip())

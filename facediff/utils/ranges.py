@@ -28,7 +28,6 @@ Factor = Annotated[float, Range(1e-9, 1e9)]
 """What lengths are multiplied by, or the end of a scale."""
 FrameRate = Annotated[float, Range(*FRAME_RATES)]
 GUIDANCE_SCALE = Range(0, 10)
-GuidanceScale = Annotated[float, GUIDANCE_SCALE]
 GazeAngle = Annotated[float, Range(0, 20, above=True)]
 USUAL_GAZE = 4.0
 """Degrees where no number is given."""

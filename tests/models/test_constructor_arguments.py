@@ -43,7 +43,7 @@ WILD = pytest.mark.parametrize(
 )
 NAMED_OTHERWISE = (
     "root people recordings lips upper_face extra_identities protocol metrics identities source sampler frame_rate "
-    "n_vertices speech_guidance identity_guidance style_guidance"
+    "n_vertices"
 )
 """Arguments that stand for files, folders or names: the sentence names these."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import nn
 from facediff import registry
 from facediff.models.dual_path.conditioning import Conditions
 from facediff.models.dual_path.network import DualPathNetwork, StepEmbedding
+from facediff.models.dual_path.options import DualPathOptions
 
 Array = np.ndarray
 DIM, HEADS = 16, 4
@@ -222,17 +224,10 @@ def test_the_step_embedding_is_sinusoids_and_an_mlp() -> None:
 
 def test_the_core_adds_the_step_before_the_norm() -> None:
     """Eq. 13, with all parts: from speech features, noisy motion, step and style to F_dec."""
-    network = DualPathNetwork(
-        coordinates=15,
-        dim=DIM,
-        audio_encoder=registry.audio_encoder.mel(dim=DIM),
-        identity_encoder=registry.identity_encoder.hierarchical(dim=DIM, n_identities=2),
-        mesh_encoder=registry.mesh_encoder.linear(dim=DIM, n_vertices=5, dims=3),
-        style_encoder=registry.style_encoder.tcn_gru_transformer(dim=DIM),
-        fusion=registry.fusion.cross_attention(dim=DIM),
-        decoder=registry.decoder.style_transformer(dim=DIM, style_dim=DIM, num_layers=1),
-        token_form="levels",  # noqa: S106
-    )
+    decoder = partial(registry.decoder.style_transformer, num_layers=1)
+    options, sizes = DualPathOptions(dim=DIM, decoder=decoder), {"n_vertices": 5, "dims": 3}
+    space = registry.motion_space.vertices(**sizes, steps=1000)
+    network = DualPathNetwork(options, space, **sizes, identities=2)
     w = weights(shaken(network))
     (audio, mask), (motion, _) = batch(), batch(seed=1)
     tokens = torch.randn(len(LENGTHS), 4, DIM)

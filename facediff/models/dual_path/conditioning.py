@@ -1,42 +1,26 @@
-"""The conditions of a clip: speech features F_a and style tokens F_s (eq. 14), which of them are hidden, and guidance.
+"""The conditions of a clip: speech features F_a and style tokens F_s (eq. 14), and which of them are hidden.
 
 They are computed once for all denoising steps (algorithm 1, line 4; algorithm 2, line 2). Hiding conditions in training
-and guiding by them in sampling are additions to the paper.
+is an addition to the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import FaceDiffError, check_known
+from facediff.errors import FaceDiffError
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.base import AnimationModel
+from facediff.models.dual_path.options import DualPathOptions, TokenForm
 from facediff.models.dual_path.speech_style import SpeechStyle
 from facediff.models.layers import exporting, frame_mask
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.speaker_encoders import IdentityEncoder, StyleEncoder
-from facediff.utils import ranges
-from facediff.utils.hints import check_number
-
-TokenForm = Literal["levels", "single"]
-
-CONDITIONS = ("speech", "identity", "style")
-"""What motion is conditioned on, in the order in which guidance adds it."""
-
-
-class Hidden(NamedTuple):
-    """Which clips lack which condition, by True; None if no clip does."""
-
-    speech: Bool[Tensor, " batch"] | None = None
-    identity: Bool[Tensor, " batch"] | None = None
-    style: Bool[Tensor, " batch"] | None = None
 
 
 @dataclass(frozen=True)
@@ -50,8 +34,6 @@ class Conditions:
         fusion: prepared by the fusion for inference.
         decoder: prepared by the decoder for inference.
         step_table: the embedding of each step; None if steps are embedded as they come.
-        shares: under guidance the rows are all clips, then all clips with some conditions hidden, and so on; this is
-            the contribution of each part's prediction.
         dynamic: F_dyn of the clips, as it was encoded; None where conditions were changed.
     """
 
@@ -61,24 +43,20 @@ class Conditions:
     fusion: object = None
     decoder: object = None
     step_table: Float[Tensor, "steps dim"] | None = None
-    shares: tuple[float, ...] = (1.0,)
     dynamic: Float[Tensor, "batch dynamic_dim"] | None = None
 
     def frames(self, places: Int[Tensor, " animated"]) -> Conditions:
         """The conditions of some of the frames, with nothing prepared."""
-        return Conditions(self.audio[:, places], self.style, self.mask[:, places], shares=self.shares)
+        return Conditions(self.audio[:, places], self.style, self.mask[:, places])
 
     def for_draws(self, times: int) -> Conditions:
         """The conditions of several noisy versions of every clip, clip by clip."""
-        audio, style, mask = (value.repeat_interleave(times, 0) for value in (self.audio, self.style, self.mask))
-        return Conditions(audio, style, mask, shares=self.shares)
+        return Conditions(*(value.repeat_interleave(times, 0) for value in (self.audio, self.style, self.mask)))
 
     def repeated(self, times: int) -> Conditions:
         """One clip's conditions for several samples of it, with nothing prepared; nothing is copied without need."""
         if times == 1:
             return self
-        if len(self.shares) > 1:
-            return self.for_draws(times)
         audio, style = (value.expand(times, -1, -1) for value in (self.audio, self.style))
         return Conditions(audio, style, self.mask.expand(times, -1))
 
@@ -153,8 +131,7 @@ class ConditionEncoding(nn.Module):
         mesh_encoder: reference motion to one feature per frame; None without a dynamic style.
         style_encoder: these features to F_dyn.
         style_tokens: F_id and F_dyn to the tokens F_s.
-        no_speech: the learnt stand-in for hidden speech; None where speech is never hidden.
-        no_style: the same for the dynamic style.
+        no_style: the learnt stand-in for a hidden dynamic style; None where it is never hidden.
         speech_style: style from speech; None where the model does not learn it.
         template_token: the neutral face as a further token; None if the network does not see it.
     """
@@ -165,7 +142,6 @@ class ConditionEncoding(nn.Module):
     mesh_encoder: MeshEncoder | None
     style_encoder: StyleEncoder
     style_tokens: StyleTokens
-    no_speech: nn.Parameter | None
     no_style: nn.Parameter | None
     speech_style: SpeechStyle | None
     template_token: TemplateToken | None
@@ -195,7 +171,7 @@ class ConditionEncoding(nn.Module):
         batch: Batch,
         identity: Int[Tensor, " batch"],
         style: Float[Tensor, "batch style_dim"],
-        hidden: Hidden = Hidden(),  # noqa: B008 - it cannot be changed
+        hidden: Bool[Tensor, " batch"] | None = None,
         animated: slice | Tensor = slice(None),
     ) -> Conditions:
         """Everything that is computed once per clip.
@@ -204,7 +180,7 @@ class ConditionEncoding(nn.Module):
             batch: its speech, or cached features of it, and its lengths.
             identity: identity indices, −1 for unknown.
             style: style vectors, of :attr:`style_dim` numbers.
-            hidden: conditions that are not given; for a multiple of the clips, which are then repeated as a whole.
+            hidden: clips with a hidden dynamic style; None if no clip has.
             animated: the frames that are animated, of speech that is encoded with more around them.
         """
         cached = batch.cached_features or ()
@@ -214,23 +190,13 @@ class ConditionEncoding(nn.Module):
         encoded = dynamic_style = self.style_from_speech(style, audio[:, animated], mask[:, animated])
         if self.training and self.speech_style is not None:
             self.speech_style.update(audio.detach(), mask, encoded.detach(), identity)
-        # Guidance asks for several views of every clip. The speech is encoded once and then repeated, since the audio
-        # encoder is the dearest part of the conditions.
-        times = max((len(mask) for mask in hidden if mask is not None), default=len(batch)) // len(batch)
-        if times > 1:
-            audio, mask = audio.repeat(times, 1, 1), mask.repeat(times, 1)
-            identity, dynamic_style = identity.repeat(times), dynamic_style.repeat(times, 1)
-        if hidden.identity is not None:
-            identity = identity.masked_fill(hidden.identity, -1)  # an unseen speaker
         # Chosen among given and learnt features, and not only where one is hidden: under several processes every weight
         # needs a gradient in every step.
-        if hidden.speech is not None and self.no_speech is not None:
-            audio = torch.where(hidden.speech[:, None, None], self.no_speech.to(audio), audio)
-        if hidden.style is not None and self.no_style is not None:
-            dynamic_style = torch.where(hidden.style[:, None], self.no_style.to(dynamic_style), dynamic_style)
+        if hidden is not None and self.no_style is not None:
+            dynamic_style = torch.where(hidden[:, None], self.no_style.to(dynamic_style), dynamic_style)
         tokens = self.style_tokens(torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1))  # eq. 14
         if self.template_token is not None:
-            tokens = torch.cat([tokens, self.template_token(batch.template).repeat(times, 1, 1)], dim=1)
+            tokens = torch.cat([tokens, self.template_token(batch.template)], dim=1)
         return Conditions(audio, tokens, mask, dynamic=encoded)
 
     def dynamic_style(
@@ -250,96 +216,26 @@ def check_shape(part: nn.Module, result: Tensor, *expected: int) -> None:
         raise FaceDiffError(f"{type(part).__name__}: gives the shape {tuple(result.shape)}; expected {expected}")
 
 
-class HidingOptions(Protocol):
-    """Options of :class:`~facediff.models.dual_path.model.DualPathOptions` that are read here."""
-
-    identity_dropout: float
-    style_dropout: float
-    speech_dropout: float
-
-
 class ConditionedModel(AnimationModel):
-    """A model whose conditions are sometimes hidden in training, so that sampling can be guided by them."""
+    """A model with conditions that are sometimes hidden in training."""
 
     network: ConditionEncoding
-    options: HidingOptions
-    guidance: dict[str, float]
+    options: DualPathOptions
 
-    @property
-    def guidable(self) -> list[str]:
-        """The conditions that were hidden now and then in training, so that the model knows motion without them."""
-        network = self.network
-        shares = {
-            "speech": self.options.speech_dropout,
-            "identity": self.options.identity_dropout if network.identity_encoder.token_dims else 0.0,
-            "style": self.options.style_dropout if network.style_encoder.token_dims else 0.0,
-        }
-        return [name for name in CONDITIONS if shares[name] > 0]
-
-    def choose_guidance(self, scales: Mapping[str, float]) -> None:
-        """Follow conditions more (above 1) or less from now on; checkpoints keep the original scales."""
-        check_known("guidance", "condition", scales, CONDITIONS)
-        for name, scale in scales.items():
-            check_number("guidance", name, scale, ranges.GUIDANCE_SCALE.least, ranges.GUIDANCE_SCALE.most)
-            if scale != 1 and name not in self.guidable:
-                raise FaceDiffError(
-                    f"guidance: {name}={scale:g} needs a model that knows motion without it; train one with "
-                    f"model.{name}_dropout=0.1"
-                )
-        self.guidance = {**self.guidance, **scales}
-
-    def views(self) -> dict[tuple[str, ...], float]:
-        """Which conditions are hidden in the predictions that guidance combines, and the share of each.
-
-        With the conditions c₁ … c_K that can be hidden and their scales w₁ … w_K, the prediction is
-        G(∅) + Σ_k w_k [G(c₁ … c_k) − G(c₁ … c_{k−1})] (incremental guidance; Sun et al. 2024, DiffPoseTalk, after Ho
-        and Salimans 2022). Predictions with a share of zero are not computed: with all scales 1 there is one.
-        """
-        names = self.guidable
-        scales = [1.0, *(self.guidance[name] for name in names), 0.0]
-        shares = {tuple(names[k:]): scales[k] - scales[k + 1] for k in range(len(names) + 1)}
-        return {hidden: share for hidden, share in shares.items() if share}
-
-    def conditions(self, batch: Batch, *, guided: bool = False, animated: slice | Tensor = slice(None)) -> Conditions:
-        """Everything that is computed once per clip; in training, conditions are hidden now and then.
+    def conditions(self, batch: Batch, animated: slice | Tensor = slice(None)) -> Conditions:
+        """Everything that is computed once per clip; in training, identity and style are hidden now and then.
 
         Args:
             batch: the clips.
-            guided: follow the conditions as :meth:`choose_guidance` says; else as the model has learnt to.
             animated: the frames that are animated, of speech that is encoded with more around them.
         """
-        network, identity = self.network, batch.identity
-        hidden = self.hide(len(identity)) if self.training else Hidden()
-        if hidden.identity is not None:
-            # Index −1 stands for an unseen speaker. Clips that are shown under it teach the model to take the person
-            # from the style alone.
-            identity, hidden = identity.masked_fill(hidden.identity, -1), hidden._replace(identity=None)
-        views = self.views() if guided else {}
-        if [*views] not in ([], [()]):
-            # All views are rows of one batch, so that guidance costs one call of the network per step and not one per
-            # view.
-            hidden = Hidden(*(self._in_views(name, views, len(batch)) for name in CONDITIONS))
-            conditions = network.conditions(batch, identity, self.style_of(batch), hidden, animated)
-            return replace(conditions, shares=tuple(views.values()))
-        if hidden.speech is None and hidden.style is None:
-            return network.conditions(batch, identity, self.style_of(batch), animated=animated)
-        return network.conditions(batch, identity, self.style_of(batch), hidden, animated)
+        identity, style = self.hide(len(batch)) if self.training else (None, None)
+        # Index −1 stands for an unseen speaker. Clips that are shown under it teach the model to take the person from
+        # the style alone.
+        identities = batch.identity if identity is None else batch.identity.masked_fill(identity, -1)
+        return self.network.conditions(batch, identities, self.style_of(batch), style, animated)
 
-    def hide(self, clips: int) -> Hidden:
-        """Which conditions of which training clips are hidden."""
-        shares = {
-            "identity": self.options.identity_dropout,
-            "style": self.options.style_dropout,
-            "speech": self.options.speech_dropout,
-        }
-        masks = {
-            name: torch.rand(clips, device=self.device) < share if share else None for name, share in shares.items()
-        }
-        # Guidance starts from the motion without any of the conditions that can be hidden, which would hardly ever be
-        # seen if each were drawn by itself.
-        if (silent := masks["speech"]) is not None:
-            masks = {name: None if mask is None else mask | silent for name, mask in masks.items()}
-        return Hidden(**masks)
-
-    def _in_views(self, name: str, views: Mapping[tuple[str, ...], float], clips: int) -> Tensor:
-        return torch.tensor([name in hidden for hidden in views], device=self.device).repeat_interleave(clips)
+    def hide(self, clips: int) -> list[Bool[Tensor, " batch"] | None]:
+        """Which training clips have a hidden identity, and which a hidden style; None if no clip does."""
+        shares = (self.options.identity_dropout, self.options.style_dropout)
+        return [torch.rand(clips, device=self.device) < share if share else None for share in shares]

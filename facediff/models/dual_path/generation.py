@@ -42,14 +42,14 @@ class Generation(DualPathRecipe):
         lengths = batch.frame_lengths.tolist()
         unit = ClipNoise(batch.names, lengths, [seed] * len(batch), self.device)
         unit_of_mean = ClipNoise(mean_names(batch), lengths, [0] * len(batch), self.device)
-        return self.expressed_motion(self.conditions(batch, guided=True), unit, unit_of_mean, progress=progress)
+        return self.expressed_motion(self.conditions(batch), unit, unit_of_mean, progress=progress)
 
     @torch.no_grad()
     def generate_samples(
         self, clip: Batch, seeds: Sequence[int], *, progress: Progress | None = None
     ) -> Float[Tensor, "samples frames points dims"]:
         """The same for several seeds: speech and style are encoded once."""
-        lengths, conditions = clip.frame_lengths.tolist(), self.conditions(clip, guided=True)
+        lengths, conditions = clip.frame_lengths.tolist(), self.conditions(clip)
         unit = ClipNoise(clip.names * len(seeds), lengths * len(seeds), seeds, self.device)
         unit_of_mean = ClipNoise(mean_names(clip), lengths, [0], self.device)
         return self.expressed_motion(conditions, unit, unit_of_mean, samples=len(seeds), progress=progress)
@@ -61,7 +61,7 @@ class Generation(DualPathRecipe):
         """The same for a window of long speech, blended in every denoising step with the window before it."""
         # The speech before the window is encoded with it but not animated: features at its start depend on it.
         animated = torch.from_numpy(window.encoded).to(self.device)
-        conditions = self.conditions(clip, guided=True, animated=animated).frames(animated)
+        conditions = self.conditions(clip, animated).frames(animated)
         overlap = WindowOverlap(before, slice(max(0, window.frames - window.kept), window.frames), window.fixed)
         unit = WindowNoise(clip.names[0], window, seeds, self.device)
         unit_of_mean = WindowNoise(mean_names(clip)[0], window, [0], self.device)
@@ -133,8 +133,7 @@ class Generation(DualPathRecipe):
 
     def empty_state(self, denoiser: ConditionalDenoiser) -> Tensor:
         """A state with no values yet."""
-        rows, frames = cast(Conditions, denoiser.conditions).mask.shape
-        shape = (rows // len(denoiser.shares), frames, denoiser.width)
+        shape = (*cast(Conditions, denoiser.conditions).mask.shape, denoiser.width)
         return torch.empty(shape, device=self.device, dtype=next(self.parameters()).dtype)
 
     def decode(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,13 +10,12 @@ from torch import Tensor
 
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.conditioning import Conditions
-from facediff.models.dual_path.network import DualPathNetwork
-from facediff.models.folding import Blend, ConditionalDenoiser, unchanged
+from facediff.models.dual_path.generation import Generation
+from facediff.models.folding import unchanged
 from facediff.models.graphs import (
     BATCH,
     FRAMES,
     Graph,
-    GraphedModel,
     Graphs,
     ModelPart,
     SamplingLoop,
@@ -26,41 +24,10 @@ from facediff.models.graphs import (
     style_graphs,
     update_table,
 )
-from facediff.models.motion_space import MotionSpace
-from facediff.models.samplers import NoiseProcess, Sampler
 from facediff.registry import name_of
 
 
-class DualPathModel(GraphedModel, Protocol):
-    """A dual-path model as its graphs see it."""
-
-    network: DualPathNetwork
-    motion_space: MotionSpace
-    process: NoiseProcess
-    sampler: Sampler
-
-    @property
-    def folds(self) -> bool:
-        """Whether the sampler runs on folded motion."""
-
-    @property
-    def scale(self) -> float:
-        """Factor from offsets to the motion that the network sees."""
-
-    def denoiser(self, conditions: Conditions, blend: Blend) -> ConditionalDenoiser:
-        """The network under some conditions."""
-
-    def views(self) -> dict[tuple[str, ...], float]:
-        """The predictions that guidance combines."""
-
-    def choosing(self) -> AbstractContextManager[None]:
-        """Within it, chosen settings are temporary."""
-
-    def choose_low_latency(self) -> None:
-        """Sample in few steps."""
-
-
-class StepGraph(ModelPart[DualPathModel]):
+class StepGraph(ModelPart[Generation]):
     """Noisy motion to clean motion at one step, under speech, identity and style."""
 
     def forward(
@@ -100,10 +67,10 @@ class StepGraph(ModelPart[DualPathModel]):
         return denoiser.denoise(state, step), joined[0]
 
 
-class SampleGraph(ModelPart[DualPathModel]):
+class SampleGraph(ModelPart[Generation]):
     """The end of sampling to offsets from the template."""
 
-    def __init__(self, model: DualPathModel, decoded: Literal["sample", "kept"]) -> None:
+    def __init__(self, model: Generation, decoded: Literal["sample", "kept"]) -> None:
         super().__init__(model)
         self.decoded = decoded
 
@@ -114,12 +81,10 @@ class SampleGraph(ModelPart[DualPathModel]):
         return model.motion_space.decode(scaled) / model.scale
 
 
-def graphs_of(model: DualPathModel) -> Graphs:
+def graphs_of(model: Generation) -> Graphs:
     """A dual-path model with its present sampler as graphs and numbers."""
     if model.network.template_token is not None:
         raise FaceDiffError("template_token: a model that sees the neutral face cannot be exported; train one without")
-    if [*model.views()] != [()]:
-        raise FaceDiffError("guidance: a guided model cannot be exported; set all scales to 1")
     network, sampler = model.network, model.sampler
     with model.choosing():
         model.choose_low_latency()

@@ -18,8 +18,7 @@ Ours, and not the paper's: ``recipe.py`` (few sampling steps: ``last_noise_for``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -29,128 +28,19 @@ from facediff import registry
 from facediff.data import Batch
 from facediff.errors import ArgumentError
 from facediff.hyperparameters import takes_options, with_classes
-from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import AnimationModel
-from facediff.models.decoders import DecoderFactory, StyleTransformer
-from facediff.models.dual_path.conditioning import CONDITIONS, Conditions, TemplateToken, TokenForm
+from facediff.models.dual_path.conditioning import Conditions
 from facediff.models.dual_path.generation import Generation
 from facediff.models.dual_path.graphs import graphs_of
 from facediff.models.dual_path.network import DualPathNetwork
 from facediff.models.dual_path.objective import objective_of
-from facediff.models.dual_path.recipe import NoiseScale
-from facediff.models.dual_path.speech_style import SpeechStyle
-from facediff.models.folding import Blend, SamplingSpace, unchanged
-from facediff.models.fusions import BidirectionalCrossAttention, FusionFactory
+from facediff.models.dual_path.options import DualPathOptions
+from facediff.models.folding import Blend, unchanged
 from facediff.models.graphs import Graphs
 from facediff.models.inference import Expressivity, Progress
 from facediff.models.invented_speakers import InventedSpeakers
-from facediff.models.layers import Share, Weight, Width
 from facediff.models.losses import style_identity_loss
-from facediff.models.mesh_encoders import LinearMeshEncoder, MeshEncoderFactory
-from facediff.models.motion_space import MotionSpaceFactory, VertexMotion
-from facediff.models.samplers import DpmSolverSampler, NoiseProcess, NoiseSource, SamplerFactory, unit_noise
-from facediff.models.speaker_encoders import (
-    HierarchicalIdentity,
-    IdentityEncoderFactory,
-    StyleEncoderFactory,
-    TcnGruTransformer,
-)
-from facediff.utils import ranges
-from facediff.utils.ranges import Range
-
-
-@dataclass(kw_only=True)
-class DualPathOptions:
-    """Options of :class:`DualPathDiffusion`; the ablations of the paper are one override each.
-
-    Args:
-        dim: model width C.
-        audio_encoder: speech to features F_a.
-        identity_encoder: a speaker's label to the static identity F_id; ``none`` for the ablation.
-        motion_space: the numbers of a frame that are noised: all vertices, or principal components with a
-            preconditioned network (docs/generation.md).
-        mesh_encoder: reference motion to one feature per frame, in front of the style encoder.
-        style_encoder: these features to the dynamic style F_dyn; ``none`` for the ablation.
-        fusion: speech features and noisy motion to one sequence; ``add`` for the ablation.
-        decoder: this sequence and the style to clean motion.
-        sampler: runs the reverse process in validation, test, prediction and animation.
-        sampling_space: where it runs: ``folded`` into ``dim`` dimensions, with the same distribution of motion at a
-            cost per step that does not depend on the vertices, or on the ``vertices`` themselves, for comparison. A
-            sampler or a network that cannot be folded runs on the vertices anyway.
-        diffusion_steps: noising steps N.
-        noise_schedule: ``squaredcos_cap_v2`` (the cosine schedule), ``linear`` or ``scaled_linear``.
-        noise_draws: how often a clip is noised in a training step, each time to another step with other noise; speech
-            and style are encoded once for all of them.
-        timestep_sampling: draw training steps ``uniform``, as in the paper, or by ``log_snr``: mostly evenly over the
-            logarithm of the signal-to-noise ratio, where noise hides part of the motion. For a motion space with a
-            preconditioned network.
-        noise_scale: factor on the motion before it is noised; ``auto`` measures on the training split at which
-            scale half of its variance shows in the schedule's middle.
-        style_tokens: present the style condition as several tokens (``levels``) or one (``single``).
-        template_token: let the network see the neutral face f as a further token. The paper's algorithms pass f but do
-            not say where it enters. Such a model cannot be exported.
-        identity_dropout: share of training clips with a hidden identity, so that unseen speakers can be animated.
-        invented_speakers: share of training clips with motion and style reference multiplied by the same random
-            gains under a hidden identity, so that the style path learns more speakers than the corpus has.
-        style_dropout: share of training clips with a hidden dynamic style, so that the style can guide, and is taken
-            from the speech without a reference.
-        style_from_speech: learn to predict the style from the speech, by a regression beside the training that changes
-            nothing else (:class:`~facediff.models.dual_path.speech_style.SpeechStyle`); without a reference, an
-            identity's mean style is then changed as the speech asks.
-        speech_dropout: share of training clips with hidden speech, together with all other conditions that may be
-            hidden, so that speech can guide.
-        speech_guidance: how much more than it has learnt the model follows the speech; 1 or, with ``speech_dropout``,
-            another scale.
-        identity_guidance: the same for the identity, with ``identity_dropout``.
-        style_guidance: the same for the dynamic style, with ``style_dropout``.
-        expressivity: 0 for the predicted mean, 1 for a sample, and anything between and up to 2.
-        velocity_weight: λ_vel.
-        acceleration_weight: λ_acc.
-        face_weight: λ_face.
-        style_identity_weight: weight of telling the training identity from the dynamic style, by a linear map that is
-            used in training only; lets the style hold the person in addition to the mood.
-    """
-
-    # Components.
-    dim: Width = 256
-    audio_encoder: AudioEncoderFactory = MelEncoder
-    identity_encoder: IdentityEncoderFactory = HierarchicalIdentity
-    motion_space: MotionSpaceFactory = VertexMotion
-    mesh_encoder: MeshEncoderFactory = LinearMeshEncoder
-    style_encoder: StyleEncoderFactory = TcnGruTransformer
-    fusion: FusionFactory = BidirectionalCrossAttention
-    decoder: DecoderFactory = StyleTransformer
-    sampler: SamplerFactory = DpmSolverSampler
-    sampling_space: SamplingSpace = "folded"
-    # Noise.
-    diffusion_steps: Annotated[int, Range(1, 100_000)] = 1000
-    noise_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"] = "squaredcos_cap_v2"
-    noise_draws: Annotated[int, Range(1, 64)] = 1
-    timestep_sampling: Literal["uniform", "log_snr"] = "uniform"
-    noise_scale: NoiseScale = 1.0
-    # Conditions: how they are presented, how often they are hidden, how far they guide.
-    style_tokens: TokenForm = "levels"
-    template_token: bool = False
-    identity_dropout: Share = 0.1
-    invented_speakers: Share = 0.0
-    style_dropout: Share = 0.0
-    style_from_speech: bool = False
-    speech_dropout: Share = 0.0
-    speech_guidance: ranges.GuidanceScale = 1.0
-    identity_guidance: ranges.GuidanceScale = 1.0
-    style_guidance: ranges.GuidanceScale = 1.0
-    expressivity: ranges.Expressivity = 1.0
-    # Weights of losses.
-    velocity_weight: Weight = 0.003
-    acceleration_weight: Weight = 0.003
-    face_weight: Weight = 0.0005
-    style_identity_weight: Weight = 0.0
-
-    @property
-    def loss_weights(self) -> dict[str, float]:
-        """The weights of eq. 15."""
-        weights = {"velocity": self.velocity_weight, "acceleration": self.acceleration_weight, "face": self.face_weight}
-        return {"reconstruction": 1.0, **weights}
+from facediff.models.samplers import NoiseProcess, NoiseSource, unit_noise
 
 
 @registry.model.register("DualPathDiffusion")
@@ -167,7 +57,7 @@ class DualPathDiffusion(Generation):
 
     samples: ClassVar[bool] = True
     options: DualPathOptions
-    chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options", "guidance")
+    chosen: ClassVar[tuple[str, ...]] = (*AnimationModel.chosen, "sampler", "_sampler_options")
 
     @takes_options(DualPathOptions)
     def __init__(self, options: DualPathOptions, **common: Any) -> None:  # noqa: ANN401
@@ -181,37 +71,15 @@ class DualPathDiffusion(Generation):
         self.sampler = options.sampler(process=self.process)
         self._trained_steps = self.sampler.steps
         self.motion_space = options.motion_space(**points, steps=options.diffusion_steps)
-        preconditioned = self.motion_space.preconditioning is not None
-        if options.timestep_sampling == "log_snr" and not preconditioned:
+        if options.timestep_sampling == "log_snr" and self.motion_space.preconditioning is None:
             raise ArgumentError({"timestep_sampling": "log_snr"}, "needs motion_space=components")
-        dim = options.dim
-        style = options.style_encoder(dim=dim)
-        style_dim = sum(style.token_dims)
-        self.network = DualPathNetwork(
-            coordinates=self.motion_space.coordinates,
-            inputs=self.motion_space.inputs,
-            dim=dim,
-            audio_encoder=options.audio_encoder(dim=dim),
-            identity_encoder=options.identity_encoder(dim=dim, n_identities=speakers),
-            # Without a dynamic style there is nothing to embed, and no idle weights.
-            mesh_encoder=options.mesh_encoder(dim=dim, **points) if style_dim else None,
-            style_encoder=style,
-            fusion=options.fusion(dim=dim),
-            decoder=options.decoder(dim=dim, style_dim=dim),
-            token_form=options.style_tokens,
-            template_token=TemplateToken(self.n_vertices, self.dims, dim) if options.template_token else None,
-            speech_may_hide=options.speech_dropout > 0,
-            style_may_hide=options.style_dropout > 0,
-            starts_at_zero=preconditioned,
-            speech_style=SpeechStyle(dim, style_dim, speakers) if options.style_from_speech else None,
-        )
+        self.network = DualPathNetwork(options, self.motion_space, **points, identities=speakers)
+        style_dim = sum(self.network.style_encoder.token_dims)
         terms = {"style_from_speech": options.style_from_speech, "style_identity_weight": options.style_identity_weight}
         if any(terms.values()) and not style_dim:
             raise ArgumentError(terms, "there is no dynamic style; choose a style_encoder, or omit these options")
         self.style_identity = nn.Linear(style_dim, speakers) if options.style_identity_weight else None
         self.expressivity: Expressivity = options.expressivity
-        self.guidance = dict.fromkeys(CONDITIONS, 1.0)
-        self.choose_guidance({name: getattr(options, f"{name}_guidance") for name in CONDITIONS})
 
     # Algorithm 1: training.
 

@@ -12,16 +12,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.models.audio_encoders import AudioEncoder
-from facediff.models.decoders import Decoder
 from facediff.models.dual_path.conditioning import (
     ConditionEncoding,
     Conditions,
     StyleTokens,
     TemplateToken,
-    TokenForm,
     check_shape,
 )
+from facediff.models.dual_path.options import DualPathOptions
 from facediff.models.dual_path.speech_style import SpeechStyle
 from facediff.models.folding import (
     Blend,
@@ -32,14 +30,11 @@ from facediff.models.folding import (
     fold,
     unchanged,
 )
-from facediff.models.fusions import Fusion
-from facediff.models.mesh_encoders import MeshEncoder
-from facediff.models.motion_space import Preconditioning
-from facediff.models.speaker_encoders import IdentityEncoder, StyleEncoder
+from facediff.models.motion_space import MotionSpace, Preconditioning
 
 TRUNK = (
     *("audio_encoder", "style_encoder", "style_tokens", "step_embedding", "fusion", "fused_norm", "decoder"),
-    *("no_speech", "no_style"),
+    "no_style",
 )
 """Parts of a network that depend neither on the face nor on its speakers."""
 
@@ -52,52 +47,32 @@ class DualPathNetwork(ConditionEncoding):
     ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
 
     Args:
-        coordinates: numbers in a frame of motion.
-        inputs: numbers in a frame that the network sees; as many if None.
-        dim: channels C.
-        audio_encoder: speech to F_a.
-        identity_encoder: identity to F_id.
-        mesh_encoder: reference motion to one feature per frame; None without a dynamic style.
-        style_encoder: these features to F_dyn.
-        fusion: F_a and F_m to F_am.
-        decoder: F_fused and style tokens to F_dec.
-        token_form: how F_s is presented to the decoder.
-        speech_may_hide: learn what stands for speech that is not given.
-        style_may_hide: the same for the dynamic style.
-        speech_style: what speech says of the style; None if that is not asked.
-        template_token: the neutral face to a further token; None if the network does not see it.
-        starts_at_zero: let training start from the posterior mean without speech, and not from random motion added to
-            it.
+        options: the model's; its components are made here.
+        space: of the motion.
+        n_vertices: points of the motion.
+        dims: numbers of a point.
+        identities: how many.
     """
 
     def __init__(
-        self,
-        *,
-        coordinates: int,
-        inputs: int | None = None,
-        dim: int,
-        audio_encoder: AudioEncoder,
-        identity_encoder: IdentityEncoder,
-        mesh_encoder: MeshEncoder | None,
-        style_encoder: StyleEncoder,
-        fusion: Fusion,
-        decoder: Decoder,
-        token_form: TokenForm,
-        speech_may_hide: bool = False,
-        style_may_hide: bool = False,
-        speech_style: SpeechStyle | None = None,
-        template_token: TemplateToken | None = None,
-        starts_at_zero: bool = False,
+        self, options: DualPathOptions, space: MotionSpace, *, n_vertices: int, dims: int, identities: int
     ) -> None:
         super().__init__()
-        self.dim = dim
-        self.coordinates = coordinates
-        self.audio_encoder = audio_encoder
-        self.identity_encoder = identity_encoder
-        self.style_encoder = style_encoder
-        self.style_tokens = StyleTokens(identity_encoder.token_dims + style_encoder.token_dims, dim, token_form)
-        self.embed = nn.Linear(coordinates if inputs is None else inputs, dim)
-        self.mesh_encoder = mesh_encoder
+        self.dim, self.coordinates = dim, coordinates = options.dim, space.coordinates
+        # The order in which parts draw their first weights, and below the order in which optimisers have them.
+        style = options.style_encoder(dim=dim)
+        style_dim = sum(style.token_dims)
+        self.audio_encoder = options.audio_encoder(dim=dim)
+        self.identity_encoder = identity = options.identity_encoder(dim=dim, n_identities=identities)
+        # Without a dynamic style there is nothing to embed, and no idle weights.
+        mesh = options.mesh_encoder(dim=dim, n_vertices=n_vertices, dims=dims) if style_dim else None
+        fusion, decoder = options.fusion(dim=dim), options.decoder(dim=dim, style_dim=dim)
+        template_token = TemplateToken(n_vertices, dims, dim) if options.template_token else None
+        speech_style = SpeechStyle(dim, style_dim, identities) if options.style_from_speech else None
+        self.style_encoder = style
+        self.style_tokens = StyleTokens(identity.token_dims + style.token_dims, dim, options.style_tokens)
+        self.embed = nn.Linear(space.inputs, dim)
+        self.mesh_encoder = mesh
         self.step_embedding = StepEmbedding(dim)
         self.fusion = fusion
         # Eq. 13's norm. It takes the size of each frame's features away, which is one reason why the network cannot
@@ -105,12 +80,12 @@ class DualPathNetwork(ConditionEncoding):
         self.fused_norm = nn.LayerNorm(dim)
         self.decoder = decoder
         self.unembed = nn.Linear(dim, coordinates)
-        if starts_at_zero:
+        if space.preconditioning is not None:
+            # Training starts from the posterior mean without speech, and not from random motion added to it.
             nn.init.zeros_(self.unembed.weight)
             nn.init.zeros_(self.unembed.bias)
-        # Only where they are trained, so that other checkpoints have no weights for them.
-        self.no_speech = nn.Parameter(torch.zeros(dim)) if speech_may_hide else None
-        self.no_style = nn.Parameter(torch.zeros(sum(style_encoder.token_dims))) if style_may_hide else None
+        # Only where it is trained, so that other checkpoints have no weights for it.
+        self.no_style = nn.Parameter(torch.zeros(style_dim)) if options.style_dropout else None
         self.speech_style = speech_style
         self.template_token = template_token
         self._of_weights: WeightCache[tuple[Tensor, Fold | None]] = WeightCache()
@@ -207,11 +182,8 @@ class DualPathNetwork(ConditionEncoding):
         fusion, decoder = self.fusion.prepare(audio, mask), self.decoder.prepare(style, mask)
         prepared = replace(conditions, fusion=fusion, decoder=decoder, step_table=table)
         if preconditioning is not None:
-            rows = (
-                mask if len(prepared.shares) == 1 else mask.chunk(len(prepared.shares))[0]
-            )  # guided views repeat the rows
-            return PreconditionedDenoiser(self, prepared, preconditioning, rows, blend, prepared.shares)
-        return ConditionalDenoiser(self, prepared, product, blend, prepared.shares)
+            return PreconditionedDenoiser(self, prepared, preconditioning, mask, blend)
+        return ConditionalDenoiser(self, prepared, product, blend)
 
 
 class StepEmbedding(nn.Module):

@@ -8,7 +8,7 @@ reference. docs/generation.md shows what each is worth; docs/method.md lists the
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Protocol, cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from facediff import registry
 from facediff.data import Reference, SpeechMotionDataModule, collate
 from facediff.errors import ArgumentError, FaceDiffError
-from facediff.models.dual_path.conditioning import ConditionedModel, HidingOptions
+from facediff.models.dual_path.conditioning import ConditionedModel
 from facediff.models.dual_path.network import DualPathNetwork
-from facediff.models.folding import SamplingSpace
+from facediff.models.dual_path.options import NumericScale
 from facediff.models.inference import Expressivity, Style
 from facediff.models.invented_speakers import InventedSpeakers
 from facediff.models.mesh_encoders import ComponentMeshEncoder
@@ -28,10 +28,6 @@ from facediff.models.samplers import NoiseProcess, Sampler
 from facediff.speech.windows import LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS
 from facediff.utils import ranges
 from facediff.utils.hints import check_number, defaults, mismatch
-from facediff.utils.ranges import Range
-
-NumericScale = Annotated[float, Range(1e-6, 1e6)]
-NoiseScale = NumericScale | Literal["auto"]
 
 NOISE_SCALE_KEY = "facediff_noise_scale"
 PRINCIPAL = 64
@@ -124,18 +120,6 @@ def spread_for(first_noise: float, last_noise: float, share: float) -> float:
     return math.sqrt(1 + 8 * (last_noise_for(first_noise, last_noise, share) - last_noise) / first_noise)
 
 
-class RecipeOptions(HidingOptions, Protocol):
-    """Options of :class:`~facediff.models.dual_path.model.DualPathOptions` that are read here."""
-
-    noise_scale: NoiseScale
-    timestep_sampling: Literal["uniform", "log_snr"]
-    sampling_space: SamplingSpace
-
-    @property
-    def loss_weights(self) -> dict[str, float]:
-        """The weights of eq. 15."""
-
-
 class DualPathRecipe(ConditionedModel):
     """A dual-path model's measurements before its training, and the settings of its sampling."""
 
@@ -145,7 +129,6 @@ class DualPathRecipe(ConditionedModel):
     process: NoiseProcess
     sampler: Sampler
     invented_speakers: InventedSpeakers | None
-    options: RecipeOptions
     _trained_steps: int  # of the sampler that the model was made with
     _sampler_options: dict[str, Any] | None = None  # of the sampler chosen since; None for the model's own
     _step_weights: Tensor | None = None  # follow from the motion space, known when training begins
