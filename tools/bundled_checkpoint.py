@@ -32,9 +32,9 @@ from facediff.cli.adapt import TRAINING_STATE
 from facediff.cli.generation_metrics import corpus_of_checkpoint
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
+from facediff.models.base import build_model
 from facediff.models.checkpoint import read_checkpoint
 from facediff.models.dual_path.network import StepEmbedding
-from facediff.models.loading import build_model
 from facediff.pipelines.export_model import compare, record, trial_speech
 from facediff.utils.hub import BUNDLED
 

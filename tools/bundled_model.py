@@ -10,8 +10,7 @@ are 121 people of LibriSpeech with up to two recordings each.
     $ $FIT && $FIT --ckpt_path last --trainer.max_epochs=16 --data.augmented_share=0.25
     $ cp runs/puppet_quality/version_0/checkpoints/last.ckpt puppet.ckpt
     $ facediff generation-metrics puppet.ckpt --samples 3 --references 1 --max-clips 30 --json puppet.json
-    $ facediff test --ckpt_path puppet.ckpt
-    $ python tools/bundled_model.py puppet.ckpt --scores runs/test/version_0/test_scores.csv
+    $ python tools/bundled_model.py puppet.ckpt
 
 The folder has graphs in 16 bits, the faces of the ten written-down speakers, and for each of the six whom the model was
 trained on a style for each mood: the mean of the styles of their training clips. Its model card is that of
@@ -74,7 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--data-root", type=Path, help="folder of the corpus (default: that of the training)")
-    parser.add_argument("--scores", type=Path, help="test_scores.csv of the checkpoint, for the model card")
     parser.add_argument("--output", type=Path, default=BUNDLED)
     given = parser.parse_args(arguments)
     model = load_model(given.checkpoint)
@@ -96,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "generation_metrics": json.loads(scores.read_text()) if scores.is_file() else None,
     }
     write_json(made / "provenance.json", provenance)
-    (made / "README.md").write_text(card(model, given.scores), encoding="utf-8")
+    (made / "README.md").write_text(card(model), encoding="utf-8")
     if given.output.is_dir():
         shutil.rmtree(given.output)
     made.rename(given.output)
@@ -104,13 +102,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"wrote {given.output}: {size / 1e6:.1f} MB")
 
 
-def card(model: AnimationModel, scores: Path | None) -> str:
+def card(model: AnimationModel) -> str:
     """The model card of `facediff publish`, without what it says of a model folder's own files."""
     with tempfile.TemporaryDirectory() as folder:
-        published = model.save_pretrained(Path(folder) / "puppet", license="apache-2.0", name="puppet", scores=scores)
+        published = model.save_pretrained(Path(folder) / "puppet", license="apache-2.0", name="puppet")
         text = (published / "README.md").read_text(encoding="utf-8")
     start, end = text.index("## How to use it"), text.index("## Licences")
-    return text[:start] + USE + SPEECH + text[end : text.index("## Files")].rstrip() + "\n"
+    return text[:start] + USE + SPEECH + text[end:]
 
 
 if __name__ == "__main__":

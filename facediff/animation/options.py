@@ -99,7 +99,7 @@ class GenerationOptions(CheckedOptions):
             clip's name (F1_e03), an identity's (F1), or a mixture of them (a.npy:0.3,b.npy:0.7); by default the one
             that the speech asks for, or else the identity's
         style_template: neutral face (mesh or .npy) of the speaker whose motion the style holds, where the checkpoint
-            does not know them; or the word median
+            does not know them
         sampler: sampler by name, with the checkpoint's spacing and last noise where its steps allow them; see `facediff
             components sampler`
         steps: denoising steps of the sampler

@@ -101,7 +101,7 @@ def provenance_of(trainer: Trainer, model: AnimationModel, data: SpeechMotionDat
     facts = describe_run(model, data)
     path = Path(split_face(trainer.ckpt_path)[0]) if isinstance(trainer.ckpt_path, str | Path) else None
     seed, steps = (model.provenance.get(name, "") for name in ("seed", "steps"))
-    scored = {"protocol", "metrics", "unseen_identity", "score_by"}  # options of scoring, not of training
+    scored = {"protocol", "metrics", "unseen_identity"}  # options of scoring, not of training
     options = {name: value for name, value in model.hparams.items() if name not in scored}
     trained = {name: value for name, value in model.data_options.items() if name not in ("root", "num_workers")}
     return Provenance(

@@ -68,11 +68,10 @@ class ScoreTable(Callback):
     """Prints the test scores with their protocol, regions and counts, and writes them as CSV.
 
     Next to the model are scored a still face, the mean face of each speaker's training clips, and the model with
-    another sentence's speech. The run's folder gets ``test_scores.csv``, ``test_scores_by.csv`` (the groups of
-    ``model.score_by``), ``test_sequences.csv`` (a row per clip and method), ``test_report.json`` (all of it for
-    programs, such as ``facediff benchmark``) and ``provenance.json``, the training run: its seed, components and the
-    checkpoint's SHA-256, which are also in every row of the scores. Weights & Biases gets the table of sequences as
-    ``test/sequences``, and the protocol's definition in the run's config.
+    another sentence's speech. The run's folder gets ``test_scores.csv``, ``test_sequences.csv`` (a row per clip and
+    method), ``test_report.json`` (all of it for programs, such as ``facediff benchmark``) and ``provenance.json``, the
+    training run: its seed, components and the checkpoint's SHA-256, which are also in every row of the scores. Weights
+    & Biases gets the table of sequences as ``test/sequences``, and the protocol's definition in the run's config.
     """
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -96,7 +95,6 @@ class ScoreTable(Callback):
             return
         evaluation = pl_module.evaluation
         rows = [row for split in evaluation.splits for row in evaluation.rows(split)]
-        groups = [row for split in evaluation.splits for row in evaluation.groups(split)]
         sequences = evaluation.sequences()
         folder = trainer.log_dir  # asked for on every process: the answer is broadcast
         if not trainer.is_global_zero:
@@ -104,8 +102,6 @@ class ScoreTable(Callback):
         assets = pl_module.assets
         metrics = list(evaluation.requests)
         print(describe_scores(rows, assets.corpus, synthetic=assets.synthetic, metrics=metrics))
-        if groups:
-            print(describe_groups(groups, evaluation.score_by))
         print(evaluation.describe())
         if folder:
             provenance = provenance_of(trainer, pl_module, trainer.datamodule)  # type: ignore[attr-defined]
@@ -117,8 +113,7 @@ class ScoreTable(Callback):
                 for part, region in row["regions"].items():
                     line |= {f"{part}_vertices": region["count"], f"{part}_hash": region["hash"]}
                 flat.append(line | provenance.columns())
-            tables = {"test_scores_by.csv": groups, "test_scores.csv": flat, "test_sequences.csv": sequences}
-            for name, table in tables.items():
+            for name, table in {"test_scores.csv": flat, "test_sequences.csv": sequences}.items():
                 if table:
                     write_rows(Path(folder) / name, table)
                     print(f"written: {Path(folder) / name}")
@@ -160,25 +155,6 @@ def describe_scores(rows: list[dict[str, Any]], corpus: str, *, synthetic: bool,
         values = [[name, *(None if row[name] is None else f"{row[name]:.4e}" for row in rows)] for name in metrics]
         lines += ["", format_table(["metric", *methods], values)]
     return "\n".join(lines)
-
-
-def describe_groups(rows: list[dict[str, Any]], by: Sequence[str]) -> str:
-    """The scores of groups of clips as text, one row per split, group and method."""
-    names = [name for name in ("mve", "lve", "fdd", "fdd_absolute") if name in rows[0]]
-    head = ["split", *by, "method", *map(str.upper, names), "frames", "clips"]
-    order = sorted(rows, key=lambda row: (row["split"], *(row[name] for name in by)))  # stable: methods keep theirs
-    body = [
-        [
-            row["split"],
-            *(row[name] or "-" for name in by),
-            METHOD_NAMES[row["method"]],
-            *(None if row[name] is None else f"{row[name]:.4e}" for name in names),
-            row["frames"],
-            row["sequences"],
-        ]
-        for row in order
-    ]
-    return f"\nby {', '.join(by)}\n{format_table(head, body, left=2 + len(by))}"
 
 
 class PredictionWriter(BasePredictionWriter):

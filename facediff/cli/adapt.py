@@ -1,4 +1,4 @@
-"""``facediff adapt``: fine-tune a model on a new speaker, or adapt its audio encoder to other voices or low latency."""
+"""``facediff adapt``: fine-tune a model on a new speaker, or adapt its audio encoder to other voices."""
 
 from __future__ import annotations
 
@@ -23,12 +23,6 @@ if TYPE_CHECKING:
     from facediff.models.audio_distillation import DistillationOptions
 
 CLIP_SECONDS = 0.05  # Training time of a clip with the built-in corpus's small model, on two processor cores
-TRAINING_STATE = (
-    *("optimizer_states", "lr_schedulers", "loops", "callbacks"),
-    *("facediff_training_state", "current_model_state", "averaging_state"),
-)
-"""Entries of a checkpoint from which its training would continue."""
-
 Mode = Literal["finetune", "joint"]
 
 
@@ -57,33 +51,25 @@ class EncoderOptions:
     """Distillation of the audio encoder.
 
     Attributes:
-        audio_encoder: with --low-latency: an encoder that replaces the checkpoint's and learns to reproduce its
-            features, such as mel or mel:num_layers=6
         augmentation: how --voices changes speech, such as room:share=0.5,seconds=0.8; once for each (default: see
-            docs/voices.md); --low-latency does not unless it is given
+            docs/voices.md)
         people: with --voices: folder of people's recordings, .wav or .flac, which the encoder also learns to hear
             in other rooms and with noise
-        interpolation: share of the distilled weights in the audio encoder's (0.85 with
-            --voices, 1 with --low-latency): less changes clean speech less
+        interpolation: share of the distilled weights in the audio encoder's (default: 0.85): less changes clean
+            speech less
     """
 
-    audio_encoder: Annotated[str | None, Option(metavar="NAME[:OPTION=VALUE,…]", needs="low_latency")] = None
-    augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]", needs="voices low_latency")] = (
-        None
-    )
+    augmentation: Annotated[list[str] | None, Option(metavar="NAME[:OPTION=VALUE,…]", needs="voices")] = None
     people: Annotated[Path | None, Option(metavar="DIR", reads=True, needs="voices")] = None
-    interpolation: Annotated[ranges.Interpolation | None, Option(metavar="SHARE", needs="voices low_latency")] = None
+    interpolation: Annotated[ranges.Interpolation | None, Option(metavar="SHARE", needs="voices")] = None
 
 
 def adapt(
     *,
     checkpoint: Checkpoint,
-    person: Annotated[str | None, Option(metavar="DIR", reads=True, without="face voices low_latency")] = None,
-    face: Annotated[str | None, Option(metavar="CORPUS", without="voices low_latency corpus")] = None,
-    voices: Annotated[
-        ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS, without="low_latency")
-    ] = None,
-    low_latency: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_LOW_LATENCY_STEPS)] = None,
+    person: Annotated[str | None, Option(metavar="DIR", reads=True, without="face voices")] = None,
+    face: Annotated[str | None, Option(metavar="CORPUS", without="voices corpus")] = None,
+    voices: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS)] = None,
     output: CheckpointFile,
     data_root: Folder = None,
     corpus: Corpus = None,
@@ -94,13 +80,12 @@ def adapt(
     encoder: EncoderOptions,
     licence: LicenceOptions,
 ) -> None:
-    """Fine-tune a checkpoint on a new speaker or a new face, or adapt its audio encoder to voices or to low latency.
+    """Fine-tune a checkpoint on a new speaker or a new face, or adapt its audio encoder to voices.
 
     With --person, the model is trained on a minute of the new speaker's motion, and knows them by name. With --face, a
     dual-path model gets a new head for another topology, or for channels, from a minute of motion. With --voices, its
-    audio encoder is distilled to be robust to other voices, rooms and noise; with --low-latency, to need no more
-    than 0.08 s of speech ahead, and a smaller encoder may take its place. The corpus that the checkpoint was trained on
-    must be on this machine.
+    audio encoder is distilled to be robust to other voices, rooms and noise. The corpus that the checkpoint was trained
+    on must be on this machine.
 
     Args:
         checkpoint: trained model (.ckpt)
@@ -109,7 +94,6 @@ def adapt(
         face: corpus of another face, by its registered name or as package.module.Class; --data-root is its folder
         voices: distil the audio encoder to be robust to other voices, rooms and noise, in so many steps (600 if no
             number)
-        low_latency: distil the audio encoder for low latency, in so many steps (1500 if no number)
         output: checkpoint to write (.ckpt)
         data_root: where the corpus is, if not where it was in training
         corpus: the corpus's class, if it is your own and no installed package registers it: package.module.Class; it
@@ -124,27 +108,21 @@ def adapt(
     check_model_source(checkpoint, "--checkpoint")
     where = (data_root, corpus)
     started = time.monotonic()
-    if voices is not None or low_latency is not None:
-        from facediff.models.audio_distillation import LOW_LATENCY_DISTILLATION, DistillationOptions
+    if voices is not None:
+        from facediff.models.audio_distillation import DistillationOptions
 
-        if low_latency is not None:
-            options = replace(LOW_LATENCY_DISTILLATION, steps=low_latency, seed=seed)
-        else:
-            steps = voices or ranges.USUAL_VOICE_STEPS
-            options = DistillationOptions(steps=steps, seed=seed, people=encoder.people)
+        options = DistillationOptions(steps=voices, seed=seed, people=encoder.people)
         options = replace(
             options,
             augmentations=encoder.augmentation or options.augmentations,
             interpolation=encoder.interpolation or options.interpolation,
         )
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
-        report = adapt_audio_encoder(
-            checkpoint, output, where, device, licence, options, encoder.audio_encoder, quiet=quiet
-        )
+        report = adapt_audio_encoder(checkpoint, output, where, device, licence, options, quiet=quiet)
     elif person is None and face is None:
         raise FaceDiffError(
-            "--person, --face, --voices, --low-latency: expected one of them: a new speaker, another face, robustness "
-            "to other voices, or an audio encoder of low latency"
+            "--person, --face, --voices: expected one of them: a new speaker, another face, or robustness to other "
+            "voices"
         )
     else:
         train = training.train or ("all" if face is None else "head")
@@ -174,9 +152,9 @@ def train_on(
     from facediff.cli.lightning import exit_statuses
     from facediff.cli.lightning_cli import IDLE_WARNINGS, without_warnings
     from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
+    from facediff.models.base import build_model
     from facediff.models.checkpoint import read_checkpoint
     from facediff.models.checkpoint_content import IMPORTED
-    from facediff.models.loading import build_model
     from facediff.utils.licences import require_cleared
     from facediff.utils.progress import on_terminal
 
@@ -237,14 +215,13 @@ def adapt_audio_encoder(
     device: str,
     licence: LicenceOptions,
     options: DistillationOptions,
-    encoder: str | None,
     *,
     quiet: bool,
 ) -> str:
     """Write a checkpoint with a distilled audio encoder; see :func:`adapt` and :func:`train_on`."""
+    from facediff.models.base import build_model
     from facediff.models.checkpoint import read_checkpoint
     from facediff.models.checkpoint_content import PROVENANCE_KEY
-    from facediff.models.loading import build_model
     from facediff.pipelines.trained import usable_device
     from facediff.utils.licences import require_cleared
 
@@ -255,9 +232,9 @@ def adapt_audio_encoder(
     module, arguments = corpus_and_folder(checkpoint, content, where[1], where[0])
     data = prepared(module(**arguments))
     content[PROVENANCE_KEY] = {**content.get(PROVENANCE_KEY, {}), "parent": model_name(checkpoint)}
-    error = write_distilled(checkpoint, content, data, output, options, encoder, device=device, quiet=quiet)
+    error = write_distilled(checkpoint, content, data, output, options, device=device, quiet=quiet)
     result = f"its features err by {error:.2f} of their variance"
-    return f"audio encoder adapted to {options.goal} in {{seconds:.0f}} s; {result}"
+    return f"audio encoder adapted to other voices in {{seconds:.0f}} s; {result}"
 
 
 def write_distilled(
@@ -266,35 +243,19 @@ def write_distilled(
     data: SpeechMotionDataModule,
     output: Path,
     options: DistillationOptions,
-    encoder: str | None = None,
     *,
     device: str = "cpu",
     quiet: bool = False,
 ) -> float:
-    """Write a checkpoint's content with a distilled audio encoder; the remaining error of its features.
-
-    ``encoder`` replaces the checkpoint's: a name with options.
-    """
+    """Write a checkpoint's content with a distilled audio encoder; the remaining error of its features."""
     from facediff.callbacks.checkpoints import AtomicCheckpointIO
-    from facediff.models.adaptation import with_audio_encoder
     from facediff.models.audio_distillation import distil_audio_encoder, encoder_weights
-    from facediff.models.loading import build_model
+    from facediff.models.base import build_model
     from facediff.utils.progress import progress_bar
 
-    model, teacher = build_model(checkpoint, content).to(device), None
-    if encoder is not None:
-        from facediff.registry import audio_encoder as registered
-
-        name, init_args = registered.read(encoder)
-        component = {"class_path": f"facediff.registry.audio_encoder.{name}", "init_args": init_args}
-        teacher, replaced = model.speech_encoder, set(encoder_weights(model))
-        model = with_audio_encoder(model, component).to(device)
-        content["hyper_parameters"] = {**content["hyper_parameters"], "audio_encoder": component}
-        content["state_dict"] = {key: weight for key, weight in content["state_dict"].items() if key not in replaced}
-        for key in TRAINING_STATE:  # it belongs to the replaced encoder; `fit` starts from the beginning
-            content.pop(key, None)
-    with progress_bar(options.goal, options.steps, shown=not quiet) as step:
-        error = distil_audio_encoder(model, data, options, step, teacher=teacher)
+    model = build_model(checkpoint, content).to(device)
+    with progress_bar("other voices", options.steps, shown=not quiet) as step:
+        error = distil_audio_encoder(model, data, options, step)
     weights = {**encoder_weights(model), **model.fit_to_features(data)}
     # Beside averaged weights, the last step's are kept for further training.
     for key in ("state_dict", "current_model_state"):

@@ -30,7 +30,7 @@ class SampleOptions:
 
     Attributes:
         samples: samples of each clip, two at least
-        references: samples of each clip with each of up to eight references and labels
+        references: samples of each clip with each of up to four references and labels
         sampler: sampler by name; see `facediff components sampler`
         steps: denoising steps of the sampler
         expressivity: 0 for the predicted mean, 1 for a sample (default: the checkpoint's)
@@ -90,8 +90,8 @@ def generation_metrics(
     for path in checkpoints:
         check_model_source(path)
     check_known("--splits", "split", splits or (), SPLITS)
+    from facediff.models.base import load_model
     from facediff.models.generation_metrics import SamplingOptions, measure
-    from facediff.models.loading import load_model
     from facediff.pipelines.trained import usable_device
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar

@@ -77,7 +77,7 @@ REPEATABLE = ("-c", "--config", "--trainer.callbacks", "--trainer.logger", "--tr
 
 FREE = (
     *("sampler", "sampling_space", "expressivity", "unseen_identity", "protocol", "metrics"),
-    *("validation_samples", "test_samples", "score_by"),
+    *("validation_samples", "test_samples"),
 )
 """Constructor arguments of a model that may differ from its checkpoint's; no weights depend on them."""
 
@@ -343,8 +343,8 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     from facediff.cli.lightning_cli import LINKS
     from facediff.data import SpeechMotionDataModule
     from facediff.data.batch import DATA_SOURCE_KEY
+    from facediff.models.base import build_model
     from facediff.models.checkpoint import corpus_of, read_checkpoint
-    from facediff.models.loading import build_model
 
     model = import_model(arguments)
     checkpoint = read_checkpoint(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +12,6 @@ from facediff.errors import FaceDiffError
 from facediff.utils import hub
 from facediff.utils.option import Option
 
-SCORES = "test_scores.csv"
-
 
 def publish(
     checkpoint: Annotated[Path, Option(metavar="CHECKPOINT", reads=True)],
@@ -23,8 +20,6 @@ def publish(
     license: Annotated[str | None, Option(metavar="NAME")] = None,
     half: bool = False,
     name: Annotated[str | None, Option(metavar="NAME")] = None,
-    scores: Annotated[Path | None, Option(metavar="FILE", reads=True)] = None,
-    languages: Annotated[Sequence[str] | None, Option(metavar="CODE,…")] = None,
     push: Annotated[str | None, Option(metavar="USER/NAME")] = None,
     private: Annotated[bool, Option(needs="push")] = False,
     licence: LicenceOptions,
@@ -46,9 +41,6 @@ def publish(
         license: licence of the weights, such as apache-2.0 or cc-by-nc-4.0 (default: the data's)
         half: store the weights in 16 bits: half as large; the motion differs a little
         name: the model's name on the card (default: from --push, else the folder's)
-        scores: test_scores.csv of `facediff test` for this model, for the card (default: the one next to the
-            checkpoint, if it is not older)
-        languages: codes of the languages that it was trained on, en,zh-CN (default: its corpus's)
         push: send the folder to this name on the hub; log in with `hf auth login` before
         private: with --push: a new model is visible to its owner alone
         licence: which models are refused.
@@ -61,32 +53,16 @@ def publish(
     from facediff.models.pretrained import published_licences
     from facediff.utils.licences import in_words
 
-    table = scores or scores_next_to(checkpoint)
     model = load_model(checkpoint, commercial_only=licence.commercial_only)
     model.provenance = {"published_from": hub.model_name(checkpoint), **model.provenance}
-    model.save_pretrained(
-        folder, half=half, license=license, name=name or push, scores=table, languages=languages or None
-    )
+    model.save_pretrained(folder, half=half, license=license, name=name or push)
     labels = in_words(published_licences(model.licences, license))
     size = sum(path.stat().st_size for path in folder.iterdir())
     weights = (folder / hub.WEIGHTS).stat().st_size
     tell(f"{folder}: {size / 1e6:.1f} MB, {weights / 1e6:.1f} of them weights; licence: {labels}")
-    tell(f"{folder / hub.CARD}: model card, {'without scores' if table is None else f'scores from {table}'}")
+    tell(f"{folder / hub.CARD}: model card; complete it before you publish")
     source = str(folder)
     if push is not None:
         tell(f"sent to {hub.push(folder, push, private=private)}")
         source = push
     tell(f"next: {shlex.join(['facediff', 'animate', 'speech.wav', '--checkpoint', source, '-o', 'speech.mp4'])}")
-
-
-def scores_next_to(checkpoint: Path) -> Path | None:
-    """The table of test scores next to a checkpoint; None if there is none, or it was written before the checkpoint."""
-    if not checkpoint.is_file():
-        return None
-    table = checkpoint.parent / SCORES
-    if not table.is_file():
-        return None
-    if table.stat().st_mtime + 1 < checkpoint.stat().st_mtime:
-        tell(f"{table}: is older than the checkpoint and was left out; give it with --scores if it is of this model")
-        return None
-    return table

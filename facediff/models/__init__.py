@@ -6,10 +6,10 @@ from facediff.utils.lazy import lazy_names
 
 if TYPE_CHECKING:
     from facediff.models.base import AnimationModel as AnimationModel
+    from facediff.models.base import load_model as load_model
     from facediff.models.dual_path import DualPathDiffusion as DualPathDiffusion
     from facediff.models.dual_path import ManyFaces as ManyFaces
     from facediff.models.inference import Style as Style
-    from facediff.models.loading import load_model as load_model
     from facediff.models.published.artalk import ARTalk as ARTalk
     from facediff.models.published.codetalker import CodeTalker as CodeTalker
     from facediff.models.published.diffposetalk import DiffPoseTalk as DiffPoseTalk
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "base": "AnimationModel",
-        "loading": "load_model",
+        "base": "AnimationModel load_model",
         "dual_path": "DualPathDiffusion ManyFaces",
         "inference": "Style",
         "published.artalk": "ARTalk",

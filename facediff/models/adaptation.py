@@ -67,27 +67,6 @@ def with_new_face(model: AnimationModel, data: SpeechMotionDataModule) -> Animat
     return face
 
 
-def with_audio_encoder(model: AnimationModel, encoder: dict[str, Any]) -> AnimationModel:
-    """The same model with another, untrained audio encoder.
-
-    Args:
-        model: a trained model.
-        encoder: the encoder as a checkpoint's hyperparameters name it: ``class_path`` and ``init_args``.
-    """
-    if (
-        model.counts_own_frames or "audio_encoder" not in model.hparams
-    ):  # the published methods have rules for their own one
-        raise FaceDiffError(f"{type(model).__name__}: its audio encoder cannot be replaced")
-    options = {key: value for key, value in model.hparams.items() if not key.startswith("_")}
-    changed: AnimationModel = instantiate_module(type(model), {**options, "audio_encoder": encoder})
-    old = {id(weight) for weight in model.speech_encoder.state_dict(keep_vars=True).values()}
-    rest = {name: weight for name, weight in model.state_dict(keep_vars=True).items() if id(weight) not in old}
-    changed.adopt(model.assets)
-    changed.load_state_dict({**changed.state_dict(), **rest})
-    changed.licences, changed.provenance = model.licences, model.provenance
-    return changed.eval()
-
-
 def grow(before: Tensor, after: Tensor) -> Tensor:
     """``before`` with as many rows as ``after``, the new ones in front and equal to the mean of the old ones."""
     if before.shape == after.shape:

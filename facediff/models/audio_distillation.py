@@ -1,6 +1,6 @@
-"""Distil a trained model's audio encoder: for robustness to other voices, rooms and microphones, or for low latency.
+"""Distil a trained model's audio encoder for robustness to other voices, rooms and microphones.
 
-**Robustness.** Training the whole model with augmented speech would teach it the same motion again for every voice,
+Training the whole model with augmented speech would teach it the same motion again for every voice,
 which takes long and costs accuracy on clean speech. Here only the audio encoder is trained: from augmented speech, the
 student must reproduce the features that the teacher, the encoder as it was, computes from the clean recording (Li,
 Seltzer, Wang, Zhao and Gong 2017, "Large-scale domain adaptation via teacher-student learning"). A step costs a small
@@ -8,11 +8,6 @@ part of a training step, and no motion is needed. In the end the weights are int
 which gives back most of the accuracy on clean speech and keeps most of the robustness (Wortsman et al. 2022, "Robust
 fine-tuning of zero-shot models"). People's recordings are heard beside the corpus's, so that it knows their voices in
 other rooms as well as the teacher knows them in their own.
-
-**Low latency.** The student gets truncated speech, which ends a moment after a frame, and must reproduce the teacher's
-features of the whole recording up to that end. Some pieces stay whole, so that recordings sound as before. The student
-may be another, smaller encoder than the teacher (Hinton, Vinyals and Dean 2015, "Distilling the knowledge in a neural
-network"): HuBERT takes a fifth of a second for each frame of a stream.
 """
 
 from __future__ import annotations
@@ -21,8 +16,9 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,11 +28,10 @@ from torch.utils.data import DataLoader, Dataset
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.augmentation import Augmenter, read_augmentations
-from facediff.errors import FaceDiffError, OptionError, refuse_idle
-from facediff.models.audio_encoders import AudioEncoder
+from facediff.errors import FaceDiffError, OptionError
 from facediff.models.base import AnimationModel
+from facediff.models.layers import frame_mask
 from facediff.speech.audio import read_speech
-from facediff.speech.windows import QUIETEST, WindowPlan
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import USUAL_VOICE_STEPS
 from facediff.utils.workers import processors
@@ -60,9 +55,6 @@ WINDOW = 4.0
 
 STEP_RATE = 50
 """Features a second at which student and teacher are compared."""
-LOW_LATENCY_WINDOW = (0.6, 1.7)
-"""Seconds of speech that a low-latency student gets, at least and at most."""
-
 
 MOST_RECORDINGS, LONGEST = 1200, 8.0
 """People's recordings that are used, of more so many are drawn, and seconds of each. They take 0.6 GB at most."""
@@ -86,8 +78,6 @@ class DistillationOptions:
         pauses: share of the pieces that get a pause, in which the background of augmented speech goes on, so that the
             student takes noise, music and babble for the teacher's silence.
         workers: processes that augment speech; 0 for this one.
-        low_latency: the student gets the speech of the model's windows at low latency; the teacher the whole recording.
-        complete_share: with ``low_latency``, the share of the pieces of which the student gets all the same everything.
         people: folder of people's recordings, which the teacher hears as they are; None for the corpus alone.
         recorded_share: of the pieces that are such recordings.
     """
@@ -102,52 +92,16 @@ class DistillationOptions:
     learning_rate: float = 1e-3
     seed: int = 0
     workers: int = 1
-    low_latency: bool = False
-    complete_share: float = 0.3
     people: Path | None = None
     recorded_share: float = 0.4
 
-    @property
-    def goal(self) -> str:
-        """The purpose of the adaptation, in words."""
-        return "low latency" if self.low_latency else "other voices"
-
-
-LOW_LATENCY_DISTILLATION = DistillationOptions(
-    augmentations=(), share=0.5, pauses=0.2, interpolation=1.0, low_latency=True
-)
-"""How an audio encoder is distilled for low latency."""
-
 
 class DistillationBatch(NamedTuple):
-    """Speech of the teacher and of the student.
-
-    Attributes:
-        clean: the teacher's input (batch, samples).
-        lengths: valid samples of each clip.
-        student_input: the same speech, augmented, or a part of it with silence after it (batch, samples).
-        student_lengths: valid samples of each piece of it.
-        teacher_steps: the teacher's step that goes with each of the student's (batch, steps).
-        steps: of the student's input.
-        compared: the student's steps that are compared, as the first of each clip and the one after the last
-            (batch, 2).
-        mean: of each clip's speech as far as the student hears it; None without low latency.
-        deviation: standard deviation of the same speech.
-    """
+    """Speech (batch, samples) of the teacher, the same speech augmented, and valid samples of each clip."""
 
     clean: Tensor
+    augmented: Tensor
     lengths: Tensor
-    student_input: Tensor
-    student_lengths: Tensor
-    teacher_steps: Tensor
-    steps: Tensor
-    compared: Tensor
-    mean: Tensor | None = None
-    deviation: Tensor | None = None
-
-    def to(self, device: torch.device) -> DistillationBatch:
-        """On a device."""
-        return DistillationBatch(*(None if part is None else part.to(device) for part in self))  # type: ignore[arg-type]
 
 
 def distil_audio_encoder(
@@ -155,8 +109,6 @@ def distil_audio_encoder(
     data: SpeechMotionDataModule,
     options: DistillationOptions = DistillationOptions(),  # noqa: B008 - it cannot be changed
     step_done: Callable[[], object] = lambda: None,
-    *,
-    teacher: AudioEncoder | None = None,
 ) -> float:
     """Distil a trained model's audio encoder in place.
 
@@ -165,7 +117,6 @@ def distil_audio_encoder(
         data: the corpus; of its training clips, only the speech is used.
         options: how.
         step_done: called after each step.
-        teacher: gives the features to reproduce; a copy of the student if None.
 
     Returns:
         the remaining error of the student's features, as a share of the teacher features' variance: the mean of the
@@ -175,16 +126,10 @@ def distil_audio_encoder(
     weights = [weight for weight in student.parameters() if weight.requires_grad]
     if not weights:
         raise FaceDiffError("audio_encoder: all of its weights are frozen; choose one that is trained, such as mel")
-    if options.low_latency:
-        refuse_idle("is an option of {voices}", people=options.people is not None)
-    teacher = (copy.deepcopy(student) if teacher is None else teacher).to(model.device).eval().requires_grad_(False)
+    teacher = copy.deepcopy(student).eval().requires_grad_(False)
     before = [weight.detach().clone() for weight in weights]
-    with model.choosing():
-        if options.low_latency:
-            model.choose_low_latency()
-        windows = model.windows
     recordings = [] if options.people is None else read_recordings(options.people, options.seed)
-    pairs = SpeechPairs(data, Augmenter(read_augmentations(options.augmentations)), options, windows, recordings)
+    pairs = SpeechPairs(data, Augmenter(read_augmentations(options.augmentations)), options, recordings)
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=max(0, workers))
     optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
@@ -196,10 +141,13 @@ def distil_audio_encoder(
         torch.manual_seed(options.seed)
         student.train()
         for batch in loader:
-            speech: DistillationBatch = batch.to(model.device)
+            clean, augmented, lengths = (part.to(model.device) for part in batch)
+            steps = (lengths * STEP_RATE // SAMPLE_RATE).clamp_min(1)
             with torch.no_grad():
-                target = teacher(speech.clean, speech.lengths, _steps(speech.lengths))
-            error = _difference(_features(student, speech), *_compared(target, speech))
+                target = teacher(clean, lengths, steps)
+            error = _difference(
+                student(augmented, lengths, steps), target, frame_mask(steps, target.shape[1])[..., None]
+            )
             optimiser.zero_grad()
             error.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(weights, 1.0)
@@ -222,31 +170,6 @@ def encoder_weights(model: AnimationModel) -> dict[str, Tensor]:
     return {f"{name}.{key}": value.detach().cpu() for key, value in model.speech_encoder.state_dict().items()}
 
 
-def _steps(samples: Tensor) -> Tensor:
-    """Features of so many samples."""
-    return (samples * STEP_RATE // SAMPLE_RATE).clamp_min(1)
-
-
-def _features(student: AudioEncoder, speech: DistillationBatch) -> Tensor:
-    """The student's features, standardised by the level of all speech so far as in a stream."""
-    arguments = speech.student_input, speech.student_lengths, speech.steps
-    if speech.mean is None or speech.deviation is None:
-        features: Tensor = student(*arguments)
-        return features
-    with student.at_level(speech.mean[:, None], speech.deviation[:, None]):
-        features = student(*arguments)
-    return features
-
-
-def _compared(target: Tensor, speech: DistillationBatch) -> tuple[Tensor, Tensor]:
-    """The teacher's features of the student's steps, and True on the steps that are compared."""
-    steps = speech.teacher_steps.clamp_max(target.shape[1] - 1)
-    column = torch.arange(steps.shape[1], device=target.device)[None]
-    first, last = speech.compared[:, :, None].unbind(1)
-    mask = (column >= first) & (column < last)
-    return target.gather(1, steps[..., None].expand(-1, -1, target.shape[2])), mask[..., None]
-
-
 def _difference(features: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """Squared difference of features (batch, steps, channels) as a share of their variance, over valid steps."""
     # Dividing by a tiny variance would let channels that carry hardly any information dominate the loss: the variance
@@ -264,16 +187,6 @@ def _rate(step: int, steps: int) -> float:
     return (step + 1) / rise if step < rise else 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
 
 
-class Piece(NamedTuple):
-    """The student's part of a clip; see :class:`DistillationBatch`."""
-
-    speech: npt.NDArray[np.float32]
-    teacher_steps: npt.NDArray[np.int64]
-    compared: tuple[int, int]
-    mean: float
-    deviation: float
-
-
 class SpeechPairs(Dataset[DistillationBatch]):
     """Batches of clean speech with the student's version of it.
 
@@ -285,12 +198,11 @@ class SpeechPairs(Dataset[DistillationBatch]):
         data: SpeechMotionDataModule,
         augmenter: Augmenter,
         options: DistillationOptions,
-        windows: WindowPlan,
         recordings: Sequence[npt.NDArray[np.float32]] = (),
     ) -> None:
         # Not the data module itself, which may hold what cannot be pickled for a worker.
         self.corpus, self.clips, self.further_speech = data.corpus, data.clips("train"), data.further_speech()
-        self.augmenter, self.options, self.windows, self.recordings = augmenter, options, windows, recordings
+        self.augmenter, self.options, self.recordings = augmenter, options, recordings
         self._further_pieces: dict[int, npt.NDArray[np.float32]] = {}
 
     def __len__(self) -> int:
@@ -301,47 +213,17 @@ class SpeechPairs(Dataset[DistillationBatch]):
         """A batch by number."""
         index = range(len(self))[index]
         random = np.random.default_rng([self.options.seed, index])
-        clean, augmented, steps_of = [], [], []
+        clean, augmented = [], []
         for _ in range(self.options.batch_size):
             speech = self._speech(random)
             if self.options.pauses and random.random() < self.options.pauses:
                 speech = with_pause(speech, random)
-            clean.append(speech)
-            steps_of.append(np.arange(max(1, len(speech) * STEP_RATE // SAMPLE_RATE)))
-            augmented.append(self._augmented(speech, random) if random.random() < self.options.share else speech)
-        teacher = _padded(clean), _lengths(clean)
-        if not self.options.low_latency:
-            counts = _lengths(steps_of)
-            compared = torch.stack([torch.zeros_like(counts), counts], 1)
-            return DistillationBatch(
-                *teacher, _padded(augmented), _lengths(augmented), _padded(steps_of), counts, compared
-            )
-        pieces = [self._piece(*clip, random) for clip in zip(augmented, map(len, steps_of), strict=True)]
-        student, student_steps, *numbers = zip(*pieces, strict=True)
-        return DistillationBatch(
-            *(*teacher, _padded(student), _lengths(student), _padded(student_steps), _lengths(student_steps)),
-            *map(torch.tensor, numbers),
-        )
-
-    def _piece(self, speech: npt.NDArray[np.float32], steps: int, random: np.random.Generator) -> Piece:
-        """The speech of a window of low latency at a random time; now and then all of it."""
-        size, windows = SAMPLE_RATE // STEP_RATE, self.windows
-        if random.random() < self.options.complete_share:
-            level = _level(speech.astype(np.float64))
-            return Piece(speech[: steps * size], np.arange(steps), (0, steps), *level)
-        after, ahead = (round(seconds * STEP_RATE) for seconds in (windows.after, windows.ahead))
-        silent = max(0, ahead - after)
-        end = int(random.integers(min(steps, after + 2), steps + 1))
-        shortest, longest = (round(seconds * STEP_RATE) for seconds in LOW_LATENCY_WINDOW)
-        start = max(0, end - int(random.integers(shortest, longest + 1)))
-        mean, deviation = _level(speech[: end * size].astype(np.float64))
-        # At the mean, which is silence once it is standardised, as in a stream.
-        piece = np.pad(speech[start * size : end * size], (0, silent * size), constant_values=mean)
-        # More than half a second before the frame, steps have enough context already, and would drown the error of the
-        # hard ones. Where nothing is animated ahead, those within the look-ahead are context only.
-        frame = end - after - start
-        compared = (max(0, frame - STEP_RATE // 2), end - start if ahead else frame)
-        return Piece(piece, np.arange(start, end + silent), compared, mean, deviation)
+            clean.append(torch.from_numpy(speech))
+            if random.random() < self.options.share:
+                speech = self.augmenter(speech, int(random.integers(2**31)))
+            augmented.append(torch.from_numpy(speech))
+        pad = partial(nn.utils.rnn.pad_sequence, batch_first=True)
+        return DistillationBatch(pad(clean), pad(augmented), torch.tensor([len(clip) for clip in clean]))
 
     def _speech(self, random: np.random.Generator) -> npt.NDArray[np.float32]:
         """A clip, a person's recording or a piece of further speech, or a random window of it."""
@@ -357,10 +239,6 @@ class SpeechPairs(Dataset[DistillationBatch]):
         frames = self.corpus.frames(clip)
         start = int(random.integers(frames - limit + 1)) if frames > limit else 0
         return self.corpus.read_audio(clip, start, min(frames, start + limit)).numpy()
-
-    def _augmented(self, speech: npt.NDArray[np.float32], random: np.random.Generator) -> npt.NDArray[np.float32]:
-        """Speech of the same length in another voice, another room or with noise."""
-        return self.augmenter(speech, int(random.integers(2**31)))
 
 
 def read_recordings(folder: Path, seed: int) -> list[npt.NDArray[np.float32]]:
@@ -385,16 +263,3 @@ def with_pause(speech: npt.NDArray[np.float32], random: np.random.Generator) -> 
     start = round(float(np.clip(random.uniform(-0.3, 1.3), 0, 1)) * (len(speech) - count))
     pause = random.standard_normal(count).astype(np.float32) * float(np.abs(speech).max(initial=0)) * np.float32(1e-4)
     return np.concatenate([speech[:start], pause, speech[start : len(speech) - count]])
-
-
-def _level(speech: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Mean and deviation as a stream takes them."""
-    return float(speech.mean()), max(float(speech.std()), QUIETEST)
-
-
-def _lengths(speech: Sequence[Any]) -> Tensor:
-    return torch.tensor([len(clip) for clip in speech])
-
-
-def _padded(speech: Sequence[Any]) -> Tensor:
-    return nn.utils.rnn.pad_sequence([torch.from_numpy(clip) for clip in speech], batch_first=True)

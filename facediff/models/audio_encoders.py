@@ -6,9 +6,9 @@ import hashlib
 import json
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from facediff.speech.windows import CONVOLUTIONS, convolved
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
-    from transformers import HubertModel, PreTrainedModel
+    from transformers import PreTrainedModel
 
 
 Waves = Float[Tensor, "batch samples"]
@@ -343,7 +343,7 @@ class HubertEncoder(FrozenEncoder):
         config: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.hubert = load_hubert(source, config)
+        self.hubert: Any = load_typed(source, config, "Model", "HuBERT", ("hubert",), encoder="hubert")
         self.train_projection = train_projection
         self.hubert.config.apply_spec_augment = spec_augment
         self.hubert.config.layerdrop = layer_drop
@@ -363,22 +363,12 @@ class HubertEncoder(FrozenEncoder):
         names = ["feature_extractor"] if self.train_projection else ["feature_extractor", "feature_projection"]
         if count:
             names += ["encoder.pos_conv_embed", "encoder.dropout", *(f"encoder.layers.{i}" for i in range(count))]
-            if not self._normalises_last or count >= len(self.hubert.encoder.layers):
+            if not normalises_last(self.hubert) or count >= len(self.hubert.encoder.layers):
                 names.append("encoder.layer_norm")
         for name in names:
             self.hubert.get_submodule(name).requires_grad_(False)
-        # Otherwise transformers marks the convolutions' input as differentiable and computes gradients for them.
-        self.hubert.feature_extractor._freeze_parameters()
-        # The embedding that SpecAugment writes over masked steps is of no use without SpecAugment.
-        mask = getattr(self.hubert, "masked_spec_embed", None)
-        if mask is not None and not self.hubert.config.apply_spec_augment:
-            mask.requires_grad_(False)
+        freeze_convolutions(self.hubert)
         return names
-
-    @property
-    def _normalises_last(self) -> bool:
-        """Whether the Transformer's own layer norm comes after its layers (large models) or before them (base)."""
-        return bool(getattr(self.hubert.config, "do_stable_layer_norm", False))
 
     def train(self, mode: bool = True) -> HubertEncoder:
         """Training mode for all but the frozen part."""
@@ -404,34 +394,13 @@ class HubertEncoder(FrozenEncoder):
         if self.train_projection:
             return features
         hidden = self.hubert.feature_projection(features)
-        return self._layers(hidden, 0, self.frozen_layers) if self.frozen_layers else hidden
+        return transformer(self.hubert, hidden, 0, self.frozen_layers) if self.frozen_layers else hidden
 
     def _upper(self, hidden: Tensor) -> Tensor:
         """The rest."""
         if self.train_projection:
             hidden = self.hubert.feature_projection(hidden)
-        first = 0 if self.train_projection else self.frozen_layers
-        return self._to_the_end(hidden, first)
-
-    def _to_the_end(self, hidden: Tensor, first: int) -> Tensor:
-        """All Transformer layers from ``first`` on."""
-        hidden = self._layers(hidden, first, len(self.hubert.encoder.layers))
-        return self.hubert.encoder.layer_norm(hidden) if self._normalises_last else hidden
-
-    def _layers(self, hidden: Tensor, first: int, last: int) -> Tensor:
-        """Transformer layers ``first`` to ``last``, with the steps before the first of all."""
-        encoder = self.hubert.encoder
-        if first == 0:
-            hidden = hidden + encoder.pos_conv_embed(hidden)
-            hidden = encoder.dropout(hidden if self._normalises_last else encoder.layer_norm(hidden))
-        for layer in encoder.layers[first:last]:
-            # Layer drop, as transformers does it in its own loop, which cannot be entered in the middle and drops
-            # frozen layers too.
-            if layer.training and self.hubert.config.layerdrop > 0 and torch.rand(()) < self.hubert.config.layerdrop:
-                hidden = skipped(layer, hidden)
-                continue
-            hidden = layer(hidden)
-        return hidden
+        return transformer(self.hubert, hidden, 0 if self.train_projection else self.frozen_layers)
 
     def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
         """The last hidden states."""
@@ -449,7 +418,7 @@ class HubertEncoder(FrozenEncoder):
 
     def _whole(self, wave: Tensor) -> Tensor:
         features = self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2)
-        return self._to_the_end(spec_augmented(self.hubert, self.hubert.feature_projection(features)), 0)
+        return transformer(self.hubert, spec_augmented(self.hubert, self.hubert.feature_projection(features)))
 
 
 def frozen_depth(network: PreTrainedModel, frozen_layers: int) -> int:
@@ -458,6 +427,44 @@ def frozen_depth(network: PreTrainedModel, frozen_layers: int) -> int:
     if frozen_layers > depth:
         raise ArgumentError({"frozen_layers": frozen_layers}, f"this network has {depth} layers; −1 freezes all")
     return depth if frozen_layers < 0 else frozen_layers
+
+
+def freeze_convolutions(network: Any) -> None:  # noqa: ANN401 - transformers' classes share no base that has it
+    """Freeze the convolutions, and the embedding that SpecAugment writes over masked steps where it is off."""
+    # Otherwise transformers marks the convolutions' input as differentiable and computes gradients for them.
+    network.feature_extractor._freeze_parameters()
+    mask = getattr(network, "masked_spec_embed", None)
+    if mask is not None and not network.config.apply_spec_augment:
+        mask.requires_grad_(False)
+
+
+def normalises_last(network: PreTrainedModel) -> bool:
+    """Whether the Transformer's own layer norm comes after its layers (large models) or before them (base)."""
+    return bool(getattr(network.config, "do_stable_layer_norm", False))
+
+
+def transformer(network: Any, hidden: Tensor, first: int = 0, last: int | None = None) -> Tensor:  # noqa: ANN401
+    """Transformer layers ``first`` to ``last``, or all that follow; with the steps before the first of all.
+
+    transformers' own forward pass written out, since it cannot be entered behind the convolutions or in the middle, and
+    drops frozen layers too.
+    """
+    encoder, settings, large = network.encoder, network.config, normalises_last(network)
+    if first == 0:
+        hidden = hidden + encoder.pos_conv_embed(hidden)
+        hidden = encoder.dropout(hidden if large else encoder.layer_norm(hidden))
+    # WavLM's first layer makes the bias of relative positions that all others take, so it is never skipped.
+    related, bias = settings.model_type == "wavlm", None
+    for number, layer in enumerate(encoder.layers[first:last], first):
+        droppable = layer.training and settings.layerdrop > 0 and not (related and number == 0)
+        if droppable and torch.rand(()) < settings.layerdrop:
+            hidden = skipped(layer, hidden)
+        elif related:
+            hidden, bias = layer(hidden, position_bias=bias, **({} if large else {"index": number}))[:2]
+        else:
+            hidden = layer(hidden)
+            hidden = hidden[0] if isinstance(hidden, tuple) else hidden
+    return encoder.layer_norm(hidden) if large and last is None else hidden
 
 
 def spec_augmented(network: PreTrainedModel, hidden: Tensor) -> Tensor:
@@ -566,10 +573,8 @@ class CtcEncoder(FrozenEncoder):
 # Pretrained networks: from a directory, from the hub, or from a plain configuration, with weights from a checkpoint.
 
 
-def load_hubert(source: str, config: dict[str, Any] | None) -> HubertModel:
-    """A HuBERT from a directory, from the hub, or from a plain configuration without weights."""
-    return cast("HubertModel", load_typed(source, config, {"hubert": "Hubert"}, "Model", "HuBERT", encoder="hubert"))
-
+NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
+"""Types of pretrained networks for speech at 16 kHz, built alike, and how their classes' names begin."""
 
 SOURCE = "audio_encoder.source"
 """The option that says where a pretrained network comes from, unless a model has one more."""
@@ -577,16 +582,15 @@ SOURCE = "audio_encoder.source"
 
 def load_recogniser(source: str, config: dict[str, Any] | None, option: str = SOURCE) -> PreTrainedModel:
     """A network with a CTC head from a directory, from the hub, or from a plain configuration without weights."""
-    what = "recogniser with a CTC head"
-    return load_typed(source, config, RECOGNISERS, "ForCTC", what, encoder="ctc", option=option)
+    return load_typed(source, config, "ForCTC", "recogniser with a CTC head", encoder="ctc", option=option)
 
 
 def load_typed(
     source: str,
     config: dict[str, Any] | None,
-    kinds: Mapping[str, str],
     head: str,
     what: str,
+    kinds: Sequence[str] = tuple(NETWORKS),
     *,
     encoder: str,
     option: str = SOURCE,
@@ -596,9 +600,9 @@ def load_typed(
     Args:
         source: the directory, or the name on the hub.
         config: the configuration as plain data; None to read it from ``source``.
-        kinds: how the names of transformers' classes begin, by type.
-        head: how they end for a network with this head.
+        head: end of the names of transformers' classes.
         what: the expected type of network, in errors.
+        kinds: types of :data:`NETWORKS` that it may be.
         encoder: the audio encoder that needs it, in errors.
         option: the option that ``source`` comes from, in errors.
     """
@@ -615,10 +619,10 @@ def load_typed(
             f'{option}: "{source}" is of the type {kind}; expected a {what} of the type '
             f"{' or '.join(kinds)}, such as facebook/wav2vec2-base-960h"
         )
-    network: type[PreTrainedModel] = getattr(transformers, f"{kinds[kind]}{head}")
+    network: type[PreTrainedModel] = getattr(transformers, f"{NETWORKS[kind]}{head}")
     if config is not None:
         with unreadable("config.json", what, "audio_encoder.config"):
-            return network(known_options(getattr(transformers, f"{kinds[kind]}Config"), config))
+            return network(known_options(getattr(transformers, f"{NETWORKS[kind]}Config"), config))
     bar = transformers.utils.logging.is_progress_bar_enabled()
     transformers.utils.logging.disable_progress_bar()
     try:
@@ -636,10 +640,6 @@ def load_typed(
         )
     # from_pretrained leaves evaluation mode on, and Lightning trains modules in the mode that it finds them in.
     return model.train()
-
-
-RECOGNISERS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
-"""Types of pretrained networks for speech at 16 kHz that may have a CTC head, and how their classes' names begin."""
 
 
 def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - one of transformers' configurations

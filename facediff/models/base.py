@@ -10,11 +10,12 @@ from __future__ import annotations
 import functools
 import math
 import os
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Annotated, Any, Self
+from typing import IO, Annotated, Any, Self, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,9 +29,10 @@ from facediff.hyperparameters import keeps_arguments
 from facediff.mesh.hierarchy import mesh_hierarchy
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.channel_weights import ChannelWeights, channel_weights
-from facediff.models.checkpoint import checked_file
-from facediff.models.checkpoint_content import MotionScale, PersonStyles, StyleSource
+from facediff.models.checkpoint import checked_file, misfit, model_of, naming, read_checkpoint
+from facediff.models.checkpoint_content import CheckpointContent, MotionScale, StyleSource
 from facediff.models.evaluation import Evaluation, IdentityPolicy, conditioned, to_shuffle, with_usual_styles
+from facediff.models.graphs import Graphs
 from facediff.models.inference import Prediction, noise_stream
 from facediff.models.mesh_encoders import MeshEncoder
 from facediff.models.motion_space import PrincipalComponents, Projection
@@ -38,7 +40,7 @@ from facediff.models.optimizers import FactorSchedule, Schedule, apply_at_resume
 from facediff.models.pretrained import publish
 from facediff.spaces import Space
 from facediff.speech.windows import WindowPlan
-from facediff.utils.licences import merged, network_licences
+from facediff.utils.licences import merged, network_licences, require_cleared
 from facediff.utils.ranges import Range, Vertices
 
 Decay = Annotated[float, Range(0, 1000)]
@@ -65,7 +67,7 @@ def read_space(space: object, points: int) -> Space:
     return record
 
 
-class AnimationModel(PersonStyles, ABC):
+class AnimationModel(CheckpointContent, ABC):
     """Base of all models.
 
     A model's own constructor names its own options and hands the others on::
@@ -111,7 +113,6 @@ class AnimationModel(PersonStyles, ABC):
         test_samples: samples of each test clip by a model that draws them; with more than one, a test has a row of
             their mean too, which has the lower squared error by nature (a sample's is twice a mean's if it is drawn
             from the right distribution).
-        score_by: clip attributes, such as ``[emotion,intensity]``, by which test scores are printed and written too.
     """
 
     @keeps_arguments
@@ -137,7 +138,6 @@ class AnimationModel(PersonStyles, ABC):
         style_source: StyleSource = "reference",
         validation_samples: Annotated[int, Range(1, 1000)] = 2,
         test_samples: Annotated[int, Range(1, 1000)] = 1,
-        score_by: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.n_vertices = n_vertices
@@ -161,7 +161,6 @@ class AnimationModel(PersonStyles, ABC):
         self.metrics = list(metrics)
         self.validation_samples = validation_samples
         self.test_samples = test_samples
-        self.score_by = list(score_by)
         self.windows = WindowPlan()
         self.style_source: StyleSource = style_source
         self._validation_sums: dict[str, Tensor] = {}  # of each loss term, and the number of clips
@@ -182,13 +181,7 @@ class AnimationModel(PersonStyles, ABC):
     @functools.cached_property
     def evaluation(self) -> Evaluation:
         """The metrics of validation and test; a model that only animates makes none."""
-        return Evaluation(
-            self.protocol,
-            self.unseen_identity,
-            self.metrics,
-            validation_samples=self.validation_samples,
-            score_by=self.score_by,
-        )
+        return Evaluation(self.protocol, self.unseen_identity, self.metrics, self.validation_samples)
 
     options_path = "model"
 
@@ -213,6 +206,12 @@ class AnimationModel(PersonStyles, ABC):
     def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
         """A batch's own style vectors, or else its references' vectors."""
         return self.encode_style(batch.reference, batch.reference_mask) if batch.style is None else batch.style
+
+    def graphs(self) -> Graphs:
+        """The model as graphs that run without PyTorch, with its present sampler; see :mod:`facediff.models.graphs`."""
+        raise FaceDiffError(
+            f"{type(self).__name__}: has no graphs and cannot be exported; a model that can overrides graphs()"
+        )
 
     def fit_to_features(self, data: SpeechMotionDataModule) -> dict[str, Tensor]:  # noqa: ARG002
         """Fit again the parts that were fitted to the speech features, after the audio encoder alone was trained.
@@ -533,8 +532,6 @@ class AnimationModel(PersonStyles, ABC):
         half: bool = False,
         license: str | None = None,  # noqa: A002 - the hub's word
         name: str | None = None,
-        scores: str | Path | None = None,
-        languages: Sequence[str] | None = None,
     ) -> Path:
         """Write the model as a folder that can be handed to others, or sent to the Hugging Face hub.
 
@@ -546,8 +543,6 @@ class AnimationModel(PersonStyles, ABC):
             half: store the parameters in 16 bits: half as large; the motion differs a little.
             license: licence of the weights, such as ``apache-2.0``; the data's if None.
             name: the model's name in the card; the folder's if None.
-            scores: ``test_scores.csv`` that ``facediff test`` wrote for this model, for the card.
-            languages: codes of the languages that it was trained on; its corpus's if None.
 
         Returns:
             the folder.
@@ -555,8 +550,7 @@ class AnimationModel(PersonStyles, ABC):
         Example:
             >>> model.save_pretrained("talking-face", license="apache-2.0")  # doctest: +SKIP
         """
-        table = None if scores is None else Path(scores)
-        return publish(self, Path(folder), half=half, licence=license, name=name, scores=table, languages=languages)
+        return publish(self, Path(folder), half=half, licence=license, name=name)
 
     @classmethod
     def load_from_checkpoint(
@@ -569,3 +563,55 @@ class AnimationModel(PersonStyles, ABC):
         with checked_file(checkpoint_path) as stream:
             model: Self = super().load_from_checkpoint(stream, *arguments, **{**options, "weights_only": True})
         return model
+
+
+def load_model(path: Path | str, device: str = "cpu", *, commercial_only: bool = False) -> AnimationModel:
+    """A trained model, ready for inference.
+
+    Args:
+        path: a checkpoint of any model, also of an installed package's; a model folder; or ``user/name[@revision]`` of
+            the Hugging Face hub, where no such path exists.
+        device: where it computes.
+        commercial_only: refuse a model if its licence labels do not allow commercial use.
+
+    Example:
+        >>> model = load_model("demo/puppet.ckpt")  # doctest: +SKIP
+        >>> model.animate(speech, identity="F1").vertices.shape  # doctest: +SKIP
+        torch.Size([75, 1008, 3])
+    """
+    model = build_model(path, read_checkpoint(path))
+    if commercial_only:
+        require_cleared(path, model.licences)
+    return model.to(device)
+
+
+def build_model(path: Path | str, checkpoint: dict[str, Any]) -> AnimationModel:
+    """The model of a checkpoint that :func:`read_checkpoint` has read, ready for inference on the CPU."""
+    weights = checkpoint["state_dict"]
+    # The model is rebuilt from its own options with the sizes that the checkpoint states; then come the assets,
+    # before the weights, since tables of mesh encoders are among these.
+    implementation, arguments = model_of(path, checkpoint["hyper_parameters"])
+    with naming(path), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of sizes that are 0, for example
+        built = implementation(**arguments)
+        built.on_load_checkpoint(checkpoint)
+        if difference := misfit(weights, built.state_dict()):
+            raise FaceDiffError(difference)
+        built.load_state_dict(weights)
+        model = cast(AnimationModel, built.eval())  # no other model has what it extends
+        check_styles(model)
+    return model
+
+
+def check_styles(model: AnimationModel) -> None:
+    """Refuse styles of speakers that are not as long as the model's; a single number would fill all."""
+    lengths = {len(style.vector) for style in model.person_styles.values()}
+    if not lengths:
+        return
+    still = torch.zeros(1, 1, model.n_vertices, model.dims)
+    with torch.inference_mode():
+        width = model.encode_style(still, torch.ones(1, 1, dtype=torch.bool)).shape[-1]
+    if lengths != {width}:
+        raise FaceDiffError(
+            f"its styles of speakers have {min(lengths)} numbers, those of its model {width}; the file is damaged"
+        )

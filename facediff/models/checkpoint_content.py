@@ -1,8 +1,8 @@
 """Contents of a checkpoint in addition to the weights: assets of the corpus, licences, provenance, speakers' styles.
 
-:class:`CheckpointContent` is the part of a model that writes and reads it, and :class:`PersonStyles` the one that
-encodes the speakers from all of their motion, in place of one reference clip (``style_source=person``). How an
-untrusted file is read stands in :mod:`facediff.models.checkpoint`.
+:class:`CheckpointContent` is the part of a model that writes and reads it, and encodes the speakers from all of their
+motion, in place of one reference clip (``style_source=person``). How an untrusted file is read stands in
+:mod:`facediff.models.checkpoint`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
@@ -80,6 +80,7 @@ class CheckpointContent(LightningModule, Inference):
         self.provenance: dict[str, str] = {}
         self.person_styles: dict[str, Style] = {}
         self._assets: Assets | None = None
+        self._styles_of_step: int | None = None  # the step whose weights gave the vectors
 
     @property
     def dims(self) -> int:
@@ -137,9 +138,6 @@ class CheckpointContent(LightningModule, Inference):
         Called by :meth:`adopt` (possibly more than once) and when a model is cloned for training.
         """
 
-    def encode_people(self, weights: Mapping[str, Tensor] | None = None) -> None:
-        """Compute :attr:`person_styles`; see :class:`facediff.models.checkpoint_content.PersonStyles`."""
-
     def keep_hyperparameters(self, arguments: dict[str, Any]) -> None:
         """Save the constructor's arguments as plain data, in the form that Lightning rebuilds a module from."""
         options = {**defaults(type(self)), **arguments, "space": None if self.space.is_vertices else self.space.state()}
@@ -196,47 +194,7 @@ class CheckpointContent(LightningModule, Inference):
         people = [Licence(f"speaker {Path(str(folder)).name}") for folder in options.get("people") or []]
         return merged([licence], people, network_licences(dict(self.hparams)))
 
-
-def check_weights(source: object, weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    """Refuse NaN and infinity, and weights of another kind of number, which copying would convert without a word."""
-    for name, value in weights.items():
-        converts = name in expected and expected[name].is_floating_point() != value.is_floating_point()
-        if converts or not value.isfinite().all():
-            problem = "hold NaN or infinity, so the training has diverged; use an earlier checkpoint, or train again"
-            if converts:
-                problem = f"are of the type {value.dtype}, and {expected[name].dtype} in the model; the file is damaged"
-            raise FaceDiffError(f"{source}: its weights {quoted(name)} {problem}")
-
-
-def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
-    """A checkpoint's provenance; the epochs and steps of one that says nothing else."""
-    counters = {name: checkpoint.get(key) for name, key in COUNTED.items()}
-    return {
-        **checkpoint.get(PROVENANCE_KEY, {}),
-        **{name: str(count) for name, count in counters.items() if isinstance(count, int)},
-    }
-
-
-def read_person_styles(state: Mapping[str, tuple[str, Tensor]]) -> dict[str, Style]:
-    """The styles of all motion of each speaker, from a checkpoint."""
-    for name, (_, vector) in state.items():
-        if not is_name(name) or vector.ndim != 1 or not bool(vector.isfinite().all()):
-            raise FaceDiffError(f"its style of {quoted(name)} is {quoted(vector)}; expected a name and a finite vector")
-    return {name: Style(text, vector.float()) for name, (text, vector) in state.items()}
-
-
-class PersonStyles(CheckpointContent):
-    """The part of a model that encodes its speakers before validation, test and prediction, and when it is saved."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._styles_of_step: int | None = None  # the step whose weights gave the vectors
-
-    @abstractmethod
-    def encode_style(
-        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
-        """Style vectors of reference motions, as :meth:`facediff.models.AnimationModel.encode_style`."""
+    # The speakers' styles, of all their motion.
 
     @abstractmethod
     def style_of(self, batch: Batch) -> Float[Tensor, "batch style_dim"]:
@@ -303,6 +261,34 @@ class PersonStyles(CheckpointContent):
         self.person_styles, self._styles_of_step = styles, step
 
 
+def check_weights(source: object, weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Refuse NaN and infinity, and weights of another kind of number, which copying would convert without a word."""
+    for name, value in weights.items():
+        converts = name in expected and expected[name].is_floating_point() != value.is_floating_point()
+        if converts or not value.isfinite().all():
+            problem = "hold NaN or infinity, so the training has diverged; use an earlier checkpoint, or train again"
+            if converts:
+                problem = f"are of the type {value.dtype}, and {expected[name].dtype} in the model; the file is damaged"
+            raise FaceDiffError(f"{source}: its weights {quoted(name)} {problem}")
+
+
+def read_provenance(checkpoint: Mapping[str, Any]) -> dict[str, str]:
+    """A checkpoint's provenance; the epochs and steps of one that says nothing else."""
+    counters = {name: checkpoint.get(key) for name, key in COUNTED.items()}
+    return {
+        **checkpoint.get(PROVENANCE_KEY, {}),
+        **{name: str(count) for name, count in counters.items() if isinstance(count, int)},
+    }
+
+
+def read_person_styles(state: Mapping[str, tuple[str, Tensor]]) -> dict[str, Style]:
+    """The styles of all motion of each speaker, from a checkpoint."""
+    for name, (_, vector) in state.items():
+        if not is_name(name) or vector.ndim != 1 or not bool(vector.isfinite().all()):
+            raise FaceDiffError(f"its style of {quoted(name)} is {quoted(vector)}; expected a name and a finite vector")
+    return {name: Style(text, vector.float()) for name, (text, vector) in state.items()}
+
+
 class StyleEncoding(nn.Module):
     """A model's style encoder as a module, so that it can be called with other weights than the model has.
 
@@ -310,10 +296,10 @@ class StyleEncoding(nn.Module):
         model: the model.
     """
 
-    def __init__(self, model: PersonStyles) -> None:
+    def __init__(self, model: CheckpointContent) -> None:
         super().__init__()
         self.model = model
 
     def forward(self, reference: Tensor, mask: Tensor) -> Tensor:
-        """Style vectors, as :meth:`PersonStyles.encode_style` gives them."""
+        """Style vectors, as :meth:`CheckpointContent.encode_style` gives them."""
         return self.model.encode_style(reference, mask)

@@ -18,12 +18,13 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from facediff.errors import ArgumentError, FaceDiffError, damaged
+from facediff.errors import ArgumentError, damaged
 from facediff.models.audio_encoders import Features, FrozenEncoder, Lengths, Waves, by_length, fingerprint, fourier
 from facediff.models.layers import Width, all_states, exporting, frame_mask, longest, sliding
 from facediff.registry import audio_encoder
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.limits import brief, quoted
+from facediff.utils.hints import mismatch
+from facediff.utils.limits import quoted
 from facediff.utils.torch_files import read_authors_checkpoint
 
 FRAME, HOP, SPECTRUM = 400, 160, 512
@@ -152,37 +153,24 @@ CELL = re.compile(r"(?:^|/)(fw|bw)/\w*lstm_cell/(kernel|weights|bias|biases)$")
 def network_of(graph: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor], dict[str, int], list[str]]:
     """The network's weights, its sizes, and the constants that it has no use for."""
     matched: dict[str, Tensor] = {}
-    left, repeated = [], []
-    for name, value in graph.items():
-        part = name.rpartition("/")[2]
-        cell = CELL.search(name)
-        if cell is not None:
-            part = f"{cell[1]}.{cell[2][0]}"  # k(ernel) or w(eights), b(ias)
-            part = part.replace(".w", ".k")
-        elif part[:1] not in ("h", "b") or part[1:] not in DENSE:
-            left.append(name)
-            continue
-        repeated += [part] if part in matched else []
-        matched[part] = value
-    expected = {f"{kind}{number}" for number in DENSE for kind in "hb"} | {"fw.k", "fw.b", "bw.k", "bw.b"}
-    if odd := [*repeated, *sorted(expected - matched.keys())]:
-        raise FaceDiffError(
-            f"{source}: holds no {odd[0]} or several, so it is not DeepSpeech's network; expected output_graph.pb of "
-            f"{RELEASE}"
-        )
-    try:
+    left = []
+    with damaged(source, f"expected output_graph.pb of {RELEASE}", RuntimeError):
+        for name, value in graph.items():
+            part = name.rpartition("/")[2]
+            if (cell := CELL.search(name)) is not None:
+                part = f"{cell[1]}.{'b' if cell[2][0] == 'b' else 'k'}"  # bias, or kernel that also is called weights
+            elif part[:1] not in ("h", "b") or part[1:] not in DENSE:
+                left.append(name)
+                continue
+            if part in matched or not bool(value.isfinite().all()):
+                raise ValueError(f"{name} is there twice, or holds NaN or infinity")
+            matched[part] = value
         cells = matched["fw.k"].shape[1] // 4
         ends = [*matched["h1"].shape, matched["h2"].shape[1], matched["h3"].shape[1], cells, *matched["h6"].shape]
         sizes = checked_sizes(dict(zip(SIZES, ends, strict=True)))
         state = state_of(matched, sizes)
         with torch.device("meta"):
             DeepSpeech(sizes).load_state_dict(state, assign=True)
-        if odd := [name for name, value in state.items() if not bool(value.isfinite().all())]:
-            raise ValueError(f"{odd[0]} holds NaN or infinity")
-    except (ValueError, IndexError, RuntimeError, ArgumentError) as error:
-        raise FaceDiffError(
-            f"{source}: its network has another form than DeepSpeech 0.1.0 ({brief(error)}); expected {RELEASE}"
-        ) from error
     return state, sizes, left
 
 
@@ -213,15 +201,17 @@ def gates_as_torch(rows: Tensor, cells: int) -> Tensor:
 
 def checked_sizes(sizes: Mapping[str, Any]) -> dict[str, int]:
     """The network's sizes, checked."""
-    stated = {name: sizes.get(name) for name in SIZES}
-    sizes = {name: size for name, size in sizes.items() if name != "_name_or_path"}
-    fits = all(isinstance(size, int) and not isinstance(size, bool) and 0 < size <= 1 << 16 for size in stated.values())
-    if not fits or set(sizes) != set(SIZES) or stated["inputs"] % CEPSTRA or stated["inputs"] // CEPSTRA % 2 == 0:  # type: ignore[operator]
+    stated = {name: size for name, size in sizes.items() if name != "_name_or_path"}
+    if (
+        stated.keys() != set(SIZES)
+        or any(mismatch(Width, size) for size in stated.values())
+        or (stated["inputs"] % CEPSTRA or stated["inputs"] // CEPSTRA % 2 == 0)
+    ):
         raise ArgumentError(
-            {"config": quoted(dict(sizes))},
+            {"config": quoted(stated)},
             f"expected the sizes {', '.join(SIZES)}, of which inputs is an odd multiple of {CEPSTRA}",
         )
-    return {name: int(size) for name, size in stated.items() if size is not None}
+    return stated
 
 
 # The encoder.

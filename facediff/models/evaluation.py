@@ -15,7 +15,7 @@ from torchmetrics import Metric
 
 from facediff.data import Assets, Batch, Reference, SpeechMotionDataModule
 from facediff.data.batch import pad
-from facediff.errors import ArgumentError, FaceDiffError, choices, damaged
+from facediff.errors import ArgumentError, FaceDiffError, damaged
 from facediff.metrics import (
     Context,
     EnergyScore,
@@ -166,15 +166,12 @@ class Evaluation:
         protocol_name: str,
         unseen_identity: str,
         metrics: Sequence[str] = (),
-        *,
         validation_samples: int = 2,
-        score_by: Sequence[str] = (),
     ) -> None:
         with argument("model.protocol", protocol_name):
             self.protocol = protocol(protocol_name)
         self.unseen_identity = unseen_identity
         self.validation_samples = validation_samples
-        self.score_by = list(score_by)
         self.energies: dict[str, EnergyScore] = {}
         with argument("model.metrics", list(metrics)):
             self.requests = {request.text: request for request in parse_all(metrics)}
@@ -191,8 +188,8 @@ class Evaluation:
         self, model: Inference, splits: Sequence[str], device: torch.device, data: SpeechMotionDataModule | None
     ) -> None:
         """Make empty metrics for a corpus, on the device where processes reduce them."""
-        if data is None and (self.requests or self.score_by):
-            raise FaceDiffError("model.metrics and model.score_by need a SpeechMotionDataModule; pass datamodule=…")
+        if data is None and self.requests:
+            raise FaceDiffError("model.metrics needs a SpeechMotionDataModule; pass datamodule=…")
         assets, corpus = model.assets, ScoredCorpus(data, model.assets)
         self._corpus = corpus
         self._check_space(assets)
@@ -201,7 +198,6 @@ class Evaluation:
         of_protocol = regions_of(assets) if self.protocol.channels else corpus.regions
         self.splits = list(splits)
         self._sequences = []
-        self._check_attributes(data)
         self._prepare_energies(model, corpus.regions, device)
         methods = list(METHODS) if self.splits != ["val"] else ["model"]
         self.metrics = {
@@ -398,55 +394,9 @@ class Evaluation:
         for row, (clip, frames) in enumerate(zip(batch.names, batch.frame_lengths.tolist(), strict=True)):
             clip_scores = {name: scores_of_clips[row] for name, scores_of_clips in values.items()}
             facts = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
-            self._sequences.append({**facts, **self._attributes(clip), **clip_scores})
-
-    def _attributes(self, clip: str) -> dict[str, str | None]:
-        """What scores may be grouped by, such as a clip's emotion."""
-        data = self.corpus.data
-        if data is None:
-            return {}
-        names = dict.fromkeys((*data.score_attributes, *self.score_by))
-        attributes = data.corpus.clips[clip].attributes
-        return {name: attributes.get(name) for name in names}
-
-    def _check_attributes(self, data: SpeechMotionDataModule | None) -> None:
-        """Refuse to group scores by what no clip of the splits has."""
-        clips = [clip for split in self.splits for clip in data.clips(split)] if self.score_by and data else []
-        attributes = sorted({name for clip in clips for name in clip.attributes})
-        for name in self.score_by:
-            if name not in attributes:
-                offered = choices(name, attributes) if attributes else "list attributes in clips.csv"
-                raise ArgumentError({"model.score_by": name}, f"no clip has it: {offered}", located=True)
-
-    def groups(self, split: str) -> list[dict[str, Any]]:
-        """One row per method and group of clips with equal attributes ``score_by``; collective under several processes.
-
-        Scores are pooled as over the whole split; metrics that have no value of single clips are left out.
-        """
-        if not self.score_by:
-            return []
-        rows = [row for row in self.sequences() if row["split"] == split]
-        scores: dict[str, Metric] = {**self.metrics[split]["model"].scores(), **self.chosen[split]["model"]}
-        pooled = {
-            name: metric.pooling
-            for name, metric in scores.items()
-            if isinstance(metric, SequenceMetric) and type(metric).clip_weight is SequenceMetric.clip_weight
-        }
-        groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-        for row in rows:
-            groups.setdefault((row["method"], *(row[name] or "" for name in self.score_by)), []).append(row)
-        table, methods = [], list(METHODS)
-        for key in sorted(groups, key=lambda key: (methods.index(key[0]), key[1:])):
-            members, line = groups[key], dict(zip(("method", *self.score_by), key, strict=True))
-            means: dict[str, float | None] = {}
-            for name, pooling in pooled.items():
-                valued = [row for row in members if row.get(name) is not None]
-                weights = [row["frames"] if pooling == "frames" else 1 for row in valued]
-                total = sum(row[name] * weight for row, weight in zip(valued, weights, strict=True))
-                means[name] = total / sum(weights) if valued else None
-            counts = {"frames": sum(row["frames"] for row in members), "sequences": len(members)}
-            table.append({"split": split, **line, **means, **counts})
-        return table
+            attributes = {} if corpus.data is None else corpus.data.corpus.clips[clip].attributes
+            names = () if corpus.data is None else corpus.data.score_attributes
+            self._sequences.append({**facts, **{name: attributes.get(name) for name in names}, **clip_scores})
 
     def sequences(self) -> list[dict[str, Any]]:
         """One row per test clip and method with its own scores, of all processes; collective under several.

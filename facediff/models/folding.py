@@ -8,23 +8,20 @@ x_{n−1} = a x_n + c x̂₀ + s z, can be followed through E: y_n = E x_n obeys
 Nothing in it has as many dimensions as x, and nothing is approximated. A step of ``ddpm`` on a mesh of 23 370 vertices
 takes 47 ms instead of 398 ms (tools/benchmarks/RESULTS.md).
 
-:class:`VertexSpace` and :class:`FoldedSpace` are the two spaces, for every method with linear ends. A sampler of
-the dual-path model sees a :class:`ConditionalDenoiser`, made once for each run by ``prepare_for_inference``.
+:class:`VertexSpace` and :class:`FoldedSpace` are the two spaces, for every method with linear ends.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Literal, TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.errors import FaceDiffError
 from facediff.models.layers import Frames, exporting
-from facediff.models.motion_space import Preconditioning
 
 SamplingSpace = Literal["folded", "vertices"]
 
@@ -134,126 +131,6 @@ class FoldedSpace:
             if self._offset is None:
                 return nn.functional.linear(features.to(fold.product), fold.product, fold.offset)
             return nn.functional.linear(features.to(fold.product), fold.product) + self._offset
-
-
-# A network as a sampler sees it.
-
-
-@runtime_checkable
-class DenoisingNetwork(Protocol):
-    """A denoiser's view of a network.
-
-    Attributes:
-        coordinates: numbers in a frame of motion, 3V.
-        embed: the first map, from noisy motion to the network's width.
-        unembed: the last map, from features to clean motion.
-    """
-
-    coordinates: int
-    embed: nn.Linear
-    unembed: nn.Linear
-
-    def core(
-        self,
-        motion: Frames,
-        step: Int[Tensor, " batch"],
-        conditions: Any,  # noqa: ANN401 - the network's own
-    ) -> Frames:
-        """Everything between the two maps."""
-
-    def clean_motion(self, features: Frames) -> ScaledMotion:
-        """The last map in the weights' own precision."""
-
-
-class ConditionalDenoiser:
-    """A network under conditions, in a space in which a sampler runs without knowing which; made for one run.
-
-    Args:
-        network: predicts clean motion.
-        conditions: its conditions, with everything else that is constant over the denoising steps.
-        fold: the products of the network's ends, to run in their width; None to run on the vertices.
-        blend: changes the features that the network gives in every step.
-    """
-
-    def __init__(
-        self,
-        network: DenoisingNetwork,
-        conditions: object,
-        fold: Fold | None = None,
-        blend: Blend = unchanged,
-    ) -> None:
-        self.network = network
-        self.conditions = conditions
-        self.space: VertexSpace | FoldedSpace
-        if fold is None:
-            self.space = VertexSpace(network.embed, network.clean_motion, network.coordinates)
-        else:
-            self.space = FoldedSpace(network.embed, fold)
-        self.width = self.space.width
-        self.blend = blend
-        self._last: tuple[Tensor, Tensor] | None = None  # features and prediction of the latest step, if folded
-
-    def features(self, embedded: Frames, step: Step) -> Frames:
-        """The network's last features of embedded noisy motion, at a step counted from 0."""
-        return self.network.core(embedded, step_of_rows(step, embedded), self.conditions)
-
-    def noise(self, unit: State) -> State:
-        """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
-        return self.space.noise(unit)
-
-    def denoise(self, state: State, step: Step) -> State:
-        """The image of the predicted clean motion M̂⁰."""
-        features = self.blend(self.features(self.space.embed(state), step))
-        prediction = self.space.clean(features)
-        if isinstance(self.space, FoldedSpace):
-            self._last = features, prediction
-        return prediction
-
-    def motion(self, sample: State, frames: slice = slice(None)) -> WantedMotion:  # noqa: B008
-        """Scaled motion of the sampler's result in some frames; where folded, the only map to the vertices."""
-        if not isinstance(self.space, FoldedSpace):
-            return sample[:, frames]
-        # y alone does not say where the vertices are. But the last step of a linear sampler returns the last prediction
-        # E M̂⁰, and M̂⁰ = U h + b of the features h that the network gave for it, which were kept.
-        if self._last is None or not torch.allclose(sample, self._last[1], rtol=1e-3, atol=1e-4, equal_nan=True):
-            raise FaceDiffError(
-                "sampler: it is declared linear, but its last step does not return the last prediction; "
-                "choose --model.sampling_space=vertices"
-            )
-        return self.network.clean_motion(self._last[0][:, frames])
-
-
-class PreconditionedDenoiser(ConditionalDenoiser):
-    """Coordinates of motion with known variances; the network predicts the part that the noisy motion leaves open.
-
-    Args:
-        network: predicts that.
-        conditions: as :class:`ConditionalDenoiser` takes them.
-        preconditioning: the scales around the network.
-        mask: True on valid frames, one row for each row of the state.
-        blend: changes the predictions of every step.
-    """
-
-    def __init__(
-        self,
-        network: DenoisingNetwork,
-        conditions: object,
-        preconditioning: Preconditioning,
-        mask: Bool[Tensor, "batch frames"],
-        blend: Blend = unchanged,
-    ) -> None:
-        super().__init__(network, conditions, None, blend)
-        self.preconditioning = preconditioning
-        self.mask = mask
-
-    def denoise(self, state: State, step: Step) -> State:
-        """M̂⁰."""
-        scales, steps = self.preconditioning, step_of_rows(step, state)
-        # The state stays as it is and only the network's input is scaled: samplers know nothing of preconditioning.
-        mean = scales.posterior_mean(state, steps, self.mask)
-        features = self.features(self.network.embed(scales.inputs(state, mean, steps, self.mask)), step)
-        # The prediction is blended, not the features: the noisy motion is a part of it.
-        return self.blend(scales.clean(mean, self.network.clean_motion(features), steps, self.mask))
 
 
 # The products of the two maps.

@@ -12,7 +12,7 @@ import statistics
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any
 
@@ -45,13 +45,8 @@ from facediff.speech.phonemes import phonemes_file, read_phonemes
 from facediff.utils import ranges
 from facediff.utils.ranges import Range
 
-REFERENCES = {
-    "own": "own reference",
-    "own_other_mood": "own reference in another mood",
-    "another": "another speaker's reference",
-    "another_other_mood": "another speaker's reference in another mood",
-}
-"""The reference that gives the style. Moods are equal or not by the corpus's ``reference_attributes``."""
+REFERENCES = ("own", "another")
+"""Owner of the reference that gives the style: the speaker, or another one in the same mood."""
 
 LABELS = ("hidden", "known")
 """Whether the model is told who a trained speaker is."""
@@ -59,105 +54,99 @@ LABELS = ("hidden", "known")
 CHANNEL_GROUPS = ("expression", "jaw", "head", "eyes")
 """Groups of channels of which liveliness is measured."""
 
-GENERATION_METRICS: dict[str, str] = {
-    "liveliness_upper_face": "liveliness of the upper face (1)",
-    "liveliness_lips": "liveliness of the lips (1)",
-    "spectrum_upper_face": "spectrum of the upper face: decibels off (0)",
-    "difference_ratio_upper_face": "difference ratio of the upper face / truth's (1)",
-    "difference_ratio_lips": "difference ratio of the lips / truth's (1)",
-    "frame_step_upper_face": "frame step of the upper face / truth's (1)",
-    "frame_step_lips": "frame step of the lips / truth's (1)",
-    "spread_face": "spread / error, whole face (1)",
-    "spread_upper_face": "spread / error, upper face (1)",
-    "spread_lips": "spread / error, lips (1)",
-    "variance_upper_face": "spread / error in variances, upper face (1)",
-    "variance_lips": "spread / error in variances, lips (1)",
-    "blink_ratio": "blink rate / truth's (1)",
-    "blinks_a_minute": "blinks a minute",
-    "true_blinks_a_minute": "blinks a minute, truth",
-    "eyelid_drift": "eyelid drift between blinks / truth's (1)",
-    "fdd_still": "FDD / still face's (0)",
-    "fdd_signed_still": "FDD, signed / still face's (0)",
-    "lve": "LVE, one sample",
-    "lve_still": "LVE / still face's, one sample",
-    "lve_default_still": "LVE / still face's, one sample, with the style that animate takes",
-    "lve_mean_still": "LVE / still face's, mean of {samples} samples",
-    "lve_best_still": "LVE / still face's, best of {samples} samples",
-    "lve_mean_face": "LVE / mean face's, one sample",
-    "lve_mean_mean_face": "LVE / mean face's, mean of {samples} samples",
-    "lve_best_mean_face": "LVE / mean face's, best of {samples} samples",
-    "mve": "MVE, one sample",
-    "energy_lips": "energy score of the lips",
-    "energy_upper_face": "energy score of the upper face",
-    "closure_auc": "lips nearer at p, b, m than at other sounds, AUC / truth's (1)",
-    "closed": "lips within 1 mm at p, b, m / truth's (1)",
-    "chance": "the same at other sounds / truth's (1)",
-    "open_vowels": "opening of open vowels / truth's (1)",
-    "rounding": "narrowing at u, o, w / truth's (1)",
-    "contact": "lower lip at the teeth for f, v / truth's (1)",
-    "nearest_speaker": "nearest speaker is right, identity hidden (1; chance {chance})",
-    "true_nearest_speaker": "nearest speaker is right, truth",
-    **{
-        f"mve_{label}_{whose}": f"MVE with {title} / own, identity {label}"
-        for label in LABELS
-        for whose, title in REFERENCES.items()
-        if whose != "own"
-    },
-    "mve_hidden_own": "MVE with own reference, identity hidden",
-    "mve_known_own": "MVE with own reference, identity known",
-    **{f"param_liveliness_{name}": f"liveliness of the channels of {name} (1)" for name in CHANNEL_GROUPS},
-    "param_spread": "spread / error, all channels (1)",
-    "param_mve": "MVE of channels, one sample",
-    "real_time_factor": "real-time factor, one sample",
-}
-"""Names of the metrics in files, and their titles; in parentheses the score of the truth itself, or of a model that
-draws from the truth's distribution."""
-
-
-OF_EACH = {
-    "liveliness_upper_face": "motion_liveliness:region=upper_face",
-    "liveliness_lips": "motion_liveliness:region=lips",
-    "spectrum_upper_face": "spectrum_distance:region=upper_face",
-    "difference_ratio_upper_face": "difference_ratio:region=upper_face",
-    "difference_ratio_lips": "difference_ratio:region=lips",
-    "frame_step_upper_face": "frame_step:region=upper_face",
-    "frame_step_lips": "frame_step:region=lips",
-    "lve": "lip_vertex_error",
-    "mve": "mean_vertex_error",
-    "fdd": "face_dynamics_deviation",
-    "fdd_signed": "face_dynamics_deviation:sign=signed",
-    "blink_ratio": "blink_rate_ratio",
-    "blinks_a_minute": "blink_rate",
-    "true_blinks_a_minute": "blink_rate:of=truth",
-    "eyelid_drift": "eyelid_drift",
-}
-"""Metrics of each sample by itself, by name."""
-
-OF_SAMPLES = {
-    "lve_mean": "mean_estimate_error",
-    "lve_best": "coverage_error",
-    "energy_lips": "energy_score:region=lips",
-    "energy_upper_face": "energy_score:region=upper_face",
-    "spread_face": "spread_error_ratio",
-    "spread_upper_face": "spread_error_ratio:region=upper_face",
-    "spread_lips": "spread_error_ratio:region=lips",
-    "variance_upper_face": "spread_error_ratio:region=upper_face,squared=true",
-    "variance_lips": "spread_error_ratio:region=lips,squared=true",
-}
-"""Metrics of all samples of a clip together."""
-
 NEAREST_SPEAKER = "nearest_speaker_accuracy:components=64"
-OF_OWN_REFERENCE = {"nearest_speaker": NEAREST_SPEAKER}
-OF_BASELINES = {
+
+TABLE: dict[str, tuple[str, ...]] = {
+    "liveliness_upper_face": ("liveliness of the upper face (1)", "each", "motion_liveliness:region=upper_face"),
+    "liveliness_lips": ("liveliness of the lips (1)", "each", "motion_liveliness:region=lips"),
+    "spectrum_upper_face": (
+        "spectrum of the upper face: decibels off (0)",
+        "each",
+        "spectrum_distance:region=upper_face",
+    ),
+    "difference_ratio_upper_face": (
+        "difference ratio of the upper face / truth's (1)",
+        "each",
+        "difference_ratio:region=upper_face",
+    ),
+    "difference_ratio_lips": ("difference ratio of the lips / truth's (1)", "each", "difference_ratio:region=lips"),
+    "frame_step_upper_face": ("frame step of the upper face / truth's (1)", "each", "frame_step:region=upper_face"),
+    "frame_step_lips": ("frame step of the lips / truth's (1)", "each", "frame_step:region=lips"),
+    "spread_face": ("spread / error, whole face (1)", "samples", "spread_error_ratio"),
+    "spread_upper_face": ("spread / error, upper face (1)", "samples", "spread_error_ratio:region=upper_face"),
+    "spread_lips": ("spread / error, lips (1)", "samples", "spread_error_ratio:region=lips"),
+    "variance_upper_face": (
+        "spread / error in variances, upper face (1)",
+        "samples",
+        "spread_error_ratio:region=upper_face,squared=true",
+    ),
+    "variance_lips": (
+        "spread / error in variances, lips (1)",
+        "samples",
+        "spread_error_ratio:region=lips,squared=true",
+    ),
+    "blink_ratio": ("blink rate / truth's (1)", "each", "blink_rate_ratio"),
+    "blinks_a_minute": ("blinks a minute", "each", "blink_rate"),
+    "true_blinks_a_minute": ("blinks a minute, truth", "each", "blink_rate:of=truth"),
+    "eyelid_drift": ("eyelid drift between blinks / truth's (1)", "each", "eyelid_drift"),
+    "fdd_still": ("FDD / still face's (0)",),
+    "fdd_signed_still": ("FDD, signed / still face's (0)",),
+    "lve": ("LVE, one sample", "each", "lip_vertex_error"),
+    "lve_still": ("LVE / still face's, one sample",),
+    "lve_default_still": ("LVE / still face's, one sample, with the style that animate takes",),
+    "lve_mean_still": ("LVE / still face's, mean of {samples} samples",),
+    "lve_best_still": ("LVE / still face's, best of {samples} samples",),
+    "lve_mean_face": ("LVE / mean face's, one sample",),
+    "lve_mean_mean_face": ("LVE / mean face's, mean of {samples} samples",),
+    "lve_best_mean_face": ("LVE / mean face's, best of {samples} samples",),
+    "mve": ("MVE, one sample", "each", "mean_vertex_error"),
+    "energy_lips": ("energy score of the lips", "samples", "energy_score:region=lips"),
+    "energy_upper_face": ("energy score of the upper face", "samples", "energy_score:region=upper_face"),
+    "closure_auc": ("lips nearer at p, b, m than at other sounds, AUC / truth's (1)",),
+    "closed": ("lips within 1 mm at p, b, m / truth's (1)",),
+    "chance": ("the same at other sounds / truth's (1)",),
+    "open_vowels": ("opening of open vowels / truth's (1)",),
+    "rounding": ("narrowing at u, o, w / truth's (1)",),
+    "contact": ("lower lip at the teeth for f, v / truth's (1)",),
+    "nearest_speaker": (
+        "nearest speaker is right, identity hidden (1; chance {chance})",
+        "own_reference",
+        NEAREST_SPEAKER,
+    ),
+    "true_nearest_speaker": ("nearest speaker is right, truth", "truth", NEAREST_SPEAKER),
+    **{f"mve_{label}_another": (f"MVE with another speaker's reference / own, identity {label}",) for label in LABELS},
+    "mve_hidden_own": ("MVE with own reference, identity hidden",),
+    "mve_known_own": ("MVE with own reference, identity known",),
+    **{f"param_liveliness_{name}": (f"liveliness of the channels of {name} (1)",) for name in CHANNEL_GROUPS},
+    "param_spread": ("spread / error, all channels (1)",),
+    "param_mve": ("MVE of channels, one sample",),
+    "real_time_factor": ("real-time factor, one sample",),
+}
+"""By the names of the metrics in files: their titles, in parentheses the score of the truth itself, or of a model that
+draws from the truth's distribution; the group of motions that a metric is taken of, and the metric by name."""
+
+GENERATION_METRICS = {name: title for name, (title, *_) in TABLE.items()}
+"""Titles by name."""
+
+UNTITLED: dict[str, dict[str, str]] = {
+    "each": {"fdd": "face_dynamics_deviation", "fdd_signed": "face_dynamics_deviation:sign=signed"},
+    "samples": {"lve_mean": "mean_estimate_error", "lve_best": "coverage_error"},
     "still": {
         "still_lve": "lip_vertex_error",
         "still_fdd": "face_dynamics_deviation",
         "still_fdd_signed": "face_dynamics_deviation:sign=signed",
     },
     "mean_face": {"mean_face_lve": "lip_vertex_error"},
-    "truth": {"true_nearest_speaker": NEAREST_SPEAKER},
+    "default_style": {"lve_default": "lip_vertex_error"},
 }
-"""Metrics of two faces that do not move, and of the truth itself."""
+"""Metrics by group that are parts of ratios."""
+
+GROUPS = {
+    group: {name: row[2] for name, row in TABLE.items() if row[1:2] == (group,)} | UNTITLED.get(group, {})
+    for group in ("each", "samples", "still", "mean_face", "truth", "own_reference", "default_style")
+}
+"""Requests by name: of each sample by itself, of all samples of a clip together, of two faces that do not move, of the
+truth itself, of samples with the clip's own reference, and with the style that ``animate`` takes."""
 
 NEEDED = {"nearest_speaker": ("gallery",), "blink_ratio": ("lid_pairs",), "closed": ("closures", "lip_pairs")}
 """Metrics for which a corpus may have no files, and the files."""
@@ -197,8 +186,7 @@ class EvaluationCorpus(ScoredCorpus):
         compared, assets = data.compared_speakers, data.assets()
         speakers = sorted(name for name in assets.templates if compared is None or name in compared)
         super().__init__(data, assets, speakers)
-        tables = (OF_EACH, OF_SAMPLES, *OF_BASELINES.values(), OF_OWN_REFERENCE)
-        self.needs = {need for table in tables for text in table.values() for need in parse(text).needs}
+        self.needs = {need for table in GROUPS.values() for text in table.values() for need in parse(text).needs}
         self.teeth = None if data.mesh_corpus is None else data.mesh_corpus.read_pairs(LIP_TEETH_PAIRS)
         context = self.context(self.needs, torch.device("cpu"))
         # Of a model without noise all samples are one.
@@ -207,9 +195,9 @@ class EvaluationCorpus(ScoredCorpus):
         self.reasons = {name: self.offered.reasons[need] for name, need in lacking}
         self.channels = {name: region for name, region in context.channels.items() if name in CHANNEL_GROUPS}
 
-    def metrics(self, table: Mapping[str, str], device: torch.device, **options: Any) -> dict[str, Metric]:  # noqa: ANN401
-        """The metrics of a table that the corpus has all for, with further options."""
-        requests = {name: parse(text) for name, text in table.items()}
+    def metrics(self, group: str, device: torch.device, **options: Any) -> dict[str, Metric]:  # noqa: ANN401
+        """The metrics of a group that the corpus has all for, with further options."""
+        requests = {name: parse(text) for name, text in GROUPS[group].items()}
         return {
             name: replace(request, options={**request.options, **options}).build(self.offered).to(device)
             for name, request in requests.items()
@@ -235,29 +223,18 @@ class EvaluationCorpus(ScoredCorpus):
 
     def references(self, clip: Clip, template: str) -> dict[str, Clip]:
         """A clip's references by their owner; ``template`` is the name of the usual one."""
-        attributes = self.data.reference_attributes
-        candidates = {
-            name: [candidate for candidate in clips if candidate.name != clip.name]
-            for name, clips in self.data.reference_policy().candidates.items()
-        }
-        mine = candidates.get(clip.identity, [])
-        of_others = [
-            candidate for name in self.speakers if name != clip.identity for candidate in candidates.get(name, [])
+        candidates, names = self.data.reference_policy().candidates, self.data.reference_attributes
+        own = [candidate for candidate in candidates.get(clip.identity, ()) if candidate.name == template]
+        another = [
+            candidate
+            for name in self.speakers
+            for candidate in candidates.get(name, ())
+            if name != clip.identity and all(candidate.attributes.get(key) == clip.attributes.get(key) for key in names)
         ]
-
-        def alike(candidate: Clip) -> bool:
-            return all(candidate.attributes.get(name) == clip.attributes.get(name) for name in attributes)
-
-        sorts = {
-            "own": [candidate for candidate in mine if candidate.name == template],
-            "own_other_mood": [candidate for candidate in mine if not alike(candidate)],
-            "another": [candidate for candidate in of_others if alike(candidate)],
-            "another_other_mood": [candidate for candidate in of_others if not alike(candidate)],
-        }
-        # By chance, but the same for every model: moods and speakers are met about equally often.
+        # By chance, but the same for every model: speakers are met about equally often.
         return {
             whose: clips[zlib.crc32(f"{clip.name}/{whose}".encode()) % len(clips)]
-            for whose, clips in sorts.items()
+            for whose, clips in zip(REFERENCES, (own, another), strict=True)
             if clips
         }
 
@@ -278,14 +255,11 @@ class Measurement:
         self.compared = max(2, self.drawn)
         device, count = model.device, self.compared
         self.metrics: dict[str, dict[str, Metric]] = {
-            "samples": corpus.metrics(OF_SAMPLES, device, n_samples=count),
-            "each": corpus.metrics(OF_EACH, device),  # each sample by itself
-            **{face: corpus.metrics(table, device) for face, table in OF_BASELINES.items()},
-            "own_reference": corpus.metrics(OF_OWN_REFERENCE, device),
-            "references": {
-                f"{label}_{whose}": MeanVertexError().to(device) for label in LABELS for whose in REFERENCES
-            },
-            "default_style": corpus.metrics({"lve_default": "lip_vertex_error"}, device),
+            group: corpus.metrics(group, device, **({"n_samples": count} if group == "samples" else {}))
+            for group in GROUPS
+        }
+        self.metrics["references"] = {
+            f"{label}_{whose}": MeanVertexError().to(device) for label in LABELS for whose in REFERENCES
         }
         if corpus.channels:  # of the channels themselves, of motion in parameters
             of_each = {f"param_liveliness_{name}": MotionLiveliness(region) for name, region in corpus.channels.items()}
@@ -400,11 +374,7 @@ class Measurement:
                 for face in ("still", "mean_face")
             },
             "lve_default_still": ratio("lve_default", "still_lve"),
-            **{
-                f"mve_{label}_{whose}": ratio(f"{label}_{whose}", f"{label}_own")
-                for label in LABELS
-                for whose in REFERENCES
-            },
+            **{f"mve_{label}_another": ratio(f"{label}_another", f"{label}_own") for label in LABELS},
             "mve_hidden_own": raw.get("hidden_own"),
             "mve_known_own": raw.get("known_own"),
         }
@@ -438,7 +408,7 @@ class GenerationScores:
     speakers: int
     clips: dict[str, int]
     values: dict[str, dict[str, list[float | None]]]
-    missing: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str]
 
     def mean(self, split: str, name: str) -> float | None:
         """Mean over the checkpoints that have a value."""
@@ -457,19 +427,15 @@ class GenerationScores:
 
     def rows(self) -> list[dict[str, Any]]:
         """One flat row for each split and metric."""
-        table = []
-        for split, values in self.values.items():
-            for name in GENERATION_METRICS:
-                row: dict[str, Any] = {
-                    "split": split,
-                    "metric": name,
-                    "title": self.title(name),
-                    "mean": self.mean(split, name),
-                    "std": self.deviation(split, name),
-                }
-                numbered = {f"value_{number}": value for number, value in enumerate(values[name], 1)}
-                table.append(row | numbered)
-        return table
+        return [
+            {
+                **{"split": split, "metric": name, "title": self.title(name)},
+                **{"mean": self.mean(split, name), "std": self.deviation(split, name)},
+                **{f"value_{number}": value for number, value in enumerate(values[name], 1)},
+            }
+            for split, values in self.values.items()
+            for name in GENERATION_METRICS
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -479,10 +445,7 @@ class GenerationScores:
             {key: row[key] for key in keys} | {"values": self.values[row["split"]][row["metric"]]}
             for row in self.rows()
         ]
-        return {"format": FORMAT, **facts, "metrics": scores}
-
-
-FORMAT = "facediff generation metrics 1"
+        return {"format": "facediff generation metrics 1", **facts, "metrics": scores}
 
 
 def measure(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -22,7 +22,8 @@ from torch import Tensor, nn
 
 from facediff.data import Batch
 from facediff.errors import FaceDiffError
-from facediff.models.audio_encoders import AudioEncoder, Lengths, Waves
+from facediff.models.audio_encoders import Lengths, Waves
+from facediff.models.checkpoint_content import CheckpointContent
 from facediff.models.layers import of_frames
 from facediff.models.samplers import Sampler
 from facediff.registry import name_of
@@ -187,31 +188,6 @@ SpeechEncoding = Callable[[Speech, Int[Tensor, " batch"], int], Tensor]
 """Features of speech for a number of frames of each clip, and the largest of these numbers."""
 
 
-class GraphedModel(Protocol):
-    """What graphs that all models share need of a model."""
-
-    @property
-    def n_vertices(self) -> int:
-        """Vertices of the topology."""
-
-    @property
-    def dims(self) -> int:
-        """Numbers of a point."""
-
-    @property
-    def clock(self) -> FrameClock:
-        """How the model counts its frames."""
-
-    @property
-    def speech_encoder(self) -> AudioEncoder:
-        """The audio encoder."""
-
-    def encode_style(
-        self, reference: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch style_dim"]:
-        """Style vectors of reference motions."""
-
-
 ModelType = TypeVar("ModelType")
 
 
@@ -227,7 +203,7 @@ class ModelPart(nn.Module, Generic[ModelType]):
         self.model = model
 
 
-class SpeechGraph(ModelPart[GraphedModel]):
+class SpeechGraph(ModelPart[CheckpointContent]):
     """Speech to one feature per frame of motion.
 
     Args:
@@ -236,7 +212,7 @@ class SpeechGraph(ModelPart[GraphedModel]):
         steps_of: from a number of frames to the audio encoder's steps.
     """
 
-    def __init__(self, model: GraphedModel, encode: SpeechEncoding, steps_of: Callable[[int], int]) -> None:
+    def __init__(self, model: CheckpointContent, encode: SpeechEncoding, steps_of: Callable[[int], int]) -> None:
         super().__init__(model)
         self.encode = encode
         self.steps_of = steps_of
@@ -263,12 +239,9 @@ class SpeechGraph(ModelPart[GraphedModel]):
             return self.encode(Speech(audio, samples), mask.sum(1), mask.shape[1])
 
 
-def one_each(frames: int) -> int:
-    """As many steps as frames."""
-    return frames
-
-
-def speech_graph(model: GraphedModel, encode: SpeechEncoding, steps_of: Callable[[int], int] = one_each) -> Graph:
+def speech_graph(
+    model: CheckpointContent, encode: SpeechEncoding, steps_of: Callable[[int], int] = lambda frames: frames
+) -> Graph:
     """The graph of the audio encoder; see :class:`SpeechGraph` for the arguments."""
     batch, samples = 2, 32_000
     frames = model.clock.frames(samples)
@@ -291,7 +264,7 @@ def speech_graph(model: GraphedModel, encode: SpeechEncoding, steps_of: Callable
     )
 
 
-class StyleGraph(ModelPart[GraphedModel]):
+class StyleGraph(ModelPart[CheckpointContent]):
     """Reference motion to a style vector."""
 
     def forward(
@@ -302,7 +275,7 @@ class StyleGraph(ModelPart[GraphedModel]):
             return self.model.encode_style(motion, mask)
 
 
-def style_graphs(model: GraphedModel, width: int) -> list[Graph]:
+def style_graphs(model: CheckpointContent, width: int) -> list[Graph]:
     """The graph that takes a style from motion, if styles have any width."""
     batch, frames = 2, 50
     motion = torch.randn(batch, frames, model.n_vertices, model.dims, generator=torch.Generator().manual_seed(0))

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,9 +25,6 @@ from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import LOW_LATENCY, FrameClock, MotionWindow, SpeechWindows, WindowPlan
-
-if TYPE_CHECKING:
-    from facediff.models.graphs import Graphs
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 """Wraps an iteration, e.g. in a progress bar."""
@@ -417,12 +414,6 @@ class Inference(ABC):
     @abstractmethod
     def speech_encoder(self) -> AudioEncoder:
         """The audio encoder, which is told how loud a stream is."""
-
-    def graphs(self) -> Graphs:
-        """The model as graphs that run without PyTorch, with its present sampler; see :mod:`facediff.models.graphs`."""
-        raise FaceDiffError(
-            f"{type(self).__name__}: has no graphs and cannot be exported; a model that can overrides graphs()"
-        )
 
     @abstractmethod
     def encode_style(

@@ -16,7 +16,7 @@ nothing in a folder can name anything to import, to open or to run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -28,7 +28,7 @@ from torch import Tensor
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models.checkpoint_content import FACES_KEY, CheckpointContent
-from facediff.models.model_card import CardFacts, card, check_languages, read_scores
+from facediff.models.model_card import card
 from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
 from facediff.utils.hints import is_plain_text
@@ -72,8 +72,6 @@ def publish(
     half: bool = False,
     licence: str | None = None,
     name: str | None = None,
-    scores: Path | None = None,
-    languages: Sequence[str] | None = None,
 ) -> Path:
     """Write a model folder with its card, whole or not at all; see :meth:`AnimationModel.save_pretrained`."""
     _ = model.assets  # an untrained model is refused before anything is written
@@ -81,16 +79,12 @@ def publish(
         raise OptionError.naming(
             f"{{license}} {quoted(licence)}: expected a short name, such as apache-2.0 or cc-by-nc-4.0"
         )
-    check_languages(languages or ())
-    rows = [] if scores is None else read_scores(scores)
     before = model.licences
     model.licences = published_licences(before, licence)
     try:
         with atomic_folder(folder) as partial:
             write_model(model, partial, half=half)
-            sizes = {path.name: path.stat().st_size for path in partial.iterdir()}
-            facts = CardFacts(name or folder.resolve().name, rows, languages, half, sizes)
-            (partial / CARD).write_text(card(model, model.licences, facts), encoding="utf-8")
+            (partial / CARD).write_text(card(model, name or folder.resolve().name, half=half), encoding="utf-8")
     finally:
         model.licences = before
     return folder

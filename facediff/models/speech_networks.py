@@ -22,18 +22,16 @@ from facediff.models.audio_encoders import (
     Waves,
     by_length,
     fingerprint,
+    freeze_convolutions,
     frozen_depth,
     load_typed,
-    skipped,
     spec_augmented,
+    transformer,
     with_edges,
 )
 from facediff.models.layers import Share, Width, exporting, interpolate_ends, longest
 from facediff.registry import audio_encoder
 from facediff.utils.ranges import Range
-
-NETWORKS = {"wav2vec2": "Wav2Vec2", "hubert": "Hubert", "wavlm": "WavLM"}
-"""Types of networks that are built alike, and how their classes' names begin."""
 
 
 @audio_encoder.register("wav2vec2")
@@ -76,7 +74,7 @@ class Wav2Vec2Encoder(FrozenEncoder):
         config: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.network: Any = load_typed(source, config, NETWORKS, "Model", "network", encoder="wav2vec2")
+        self.network: Any = load_typed(source, config, "Model", "network", encoder="wav2vec2")
         settings = self.network.config
         settings.apply_spec_augment, settings.layerdrop = spec_augment, layer_drop
         self.epsilon, self.edges, self.do_normalize = epsilon, edges, do_normalize
@@ -91,17 +89,12 @@ class Wav2Vec2Encoder(FrozenEncoder):
     def _freeze(self, layers: int, *, everything: bool) -> None:
         """Freeze the convolutions, so many layers with the feature projection, or everything."""
         network = self.network
-        # Otherwise transformers marks the convolutions' input as differentiable and computes gradients for them.
-        network.feature_extractor._freeze_parameters()
+        freeze_convolutions(network)
         if layers:
             network.feature_projection.requires_grad_(False)
         network.encoder.layers[:layers].requires_grad_(False)
         if everything:
             network.requires_grad_(False)
-        # The embedding that SpecAugment writes over masked steps is of no use without SpecAugment.
-        mask = getattr(network, "masked_spec_embed", None)
-        if mask is not None and not network.config.apply_spec_augment:
-            mask.requires_grad_(False)
 
     def convolutions(self) -> tuple[tuple[int, int], ...]:
         """Kernels and strides in the network's configuration."""
@@ -171,29 +164,9 @@ class Wav2Vec2Encoder(FrozenEncoder):
 
     def hidden_states(self, features: Tensor) -> Tensor:
         """Hidden states of the last layer, of clips of one length."""
-        network, settings = self.network, self.network.config
-        encoder, large = network.encoder, bool(getattr(settings, "do_stable_layer_norm", False))
-        hidden = network.feature_projection(features)
+        hidden = self.network.feature_projection(features)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # wav2vec 2.0 gives its normalised input as well
-        hidden = spec_augmented(network, hidden)
-        # transformers' own forward pass written out, since it cannot be entered behind the convolutions; their result
-        # is resampled or cached. The base networks normalise here, the large ones (``do_stable_layer_norm``) after the
-        # last layer.
-        hidden = hidden + encoder.pos_conv_embed(hidden)
-        hidden = encoder.dropout(hidden if large else encoder.layer_norm(hidden))
-        # WavLM's first layer makes the bias of relative positions that all others take, so it is never skipped.
-        related, bias = settings.model_type == "wavlm", None
-        for number, layer in enumerate(encoder.layers):
-            droppable = self.training and settings.layerdrop > 0 and not (related and number == 0)
-            if droppable and float(torch.rand(())) < settings.layerdrop:
-                hidden = skipped(layer, hidden)
-                continue
-            if related:
-                hidden, bias = layer(hidden, position_bias=bias, **({} if large else {"index": number}))[:2]
-                continue
-            hidden = layer(hidden)
-            hidden = hidden[0] if isinstance(hidden, tuple) else hidden
-        return encoder.layer_norm(hidden) if large else hidden
+        return transformer(self.network, spec_augmented(self.network, hidden))
 
 
 def by_lengths(padded: Tensor, lengths: Tensor, steps: Tensor, encode: Callable[[Tensor, int], Tensor]) -> Tensor:

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     """Forms of a style in Python, see :func:`style_from`."""
 
 Array = npt.NDArray[np.float32]
-MEDIAN = "median"
-"""Instead of a template's file: the median of the motion's own frames."""
 
 
 def style_from(
@@ -44,7 +42,7 @@ def style_from(
         source: as :meth:`facediff.animation.styles.StyleReader.style` takes it, or what this function has returned.
         identity: the animated face; also the speaker of an array's motion, unless a template is given.
         model: gives the style vectors. A model that has styles by name takes only those.
-        template: neutral face of the speaker in the .npy files, or ``median``.
+        template: neutral face of the speaker in the .npy files.
     """
     if isinstance(source, Reference | Style):
         return source
@@ -196,31 +194,21 @@ class ModelStyles(StyleReader[Reference | Style]):
             rate = float(read_manifest(root).get("frame_rate") or frame_rate or rate)
         stem = path.stem.split("_condition_")[0].rpartition("_")[0]
         if self.template is not None and not (in_corpus and stem in templates):
-            return self._given_face(self.template, opened), None, rate
+            return self._given_face(Path(self.template)), None, rate
         whose = next((name for name in (stem, self.identity) if name in templates), None)
         face = assets.template(self.identity) if whose is None else templates[whose]
         return face.numpy(), whose or self.identity, rate
 
-    def _given_face(self, template: str | Path, opened: StyleFile) -> Array:
-        """The neutral face (V, 3) that was given for a motion: a mesh, an array, or ``median``."""
+    def _given_face(self, path: Path) -> Array:
+        """The neutral face (V, 3) that was given for a motion: a mesh or an array."""
         from facediff.mesh import read_mesh
 
-        path = Path(template)
-        if str(template) == MEDIAN and not path.is_file():
-            # The median of each coordinate and not the mean: a face is at rest or nearly so in more frames than in any
-            # one expression, and wide openings would pull a mean.
-            median = np.median(opened.frames(self.vertices, 1), axis=0)
-            print(
-                f"note: --style {opened.path}: the median of its {len(opened.array)} frames stands for the neutral "
-                f"face; a mouth that is open most of the time then counts as closed"
-            )
-            return np.asarray(median, np.float32)
         read = open_style(path).array if path.suffix.lower() == ".npy" else read_mesh(path).vertices
         fits = read.size == 3 * self.vertices
         face = np.asarray(read, np.float32).reshape(-1, 3) if fits else np.zeros((0, 3), np.float32)
         if not fits or not np.isfinite(face).all():
             raise OptionError.naming(
                 f"{{style_template}} {path}: has shape {read.shape}; expected the neutral face of {self.vertices} "
-                f"finite vertices whose motion is in {{style}}, as .obj, .ply or .npy, or the word {MEDIAN}"
+                f"finite vertices whose motion is in {{style}}, as .obj, .ply or .npy"
             )
         return face

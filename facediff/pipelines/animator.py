@@ -459,7 +459,7 @@ class Animator:
         *,
         half: bool = False,
         license: str | None = None,  # noqa: A002 - the hub's word
-        **card: Any,  # noqa: ANN401
+        name: str | None = None,
     ) -> Path:
         """Write a trained model as a folder that :func:`facediff.load` reads, for others or for the hub.
 
@@ -467,12 +467,12 @@ class Animator:
             folder: a folder that does not exist, or is empty.
             half: store the parameters in 16 bits; the motion differs a little.
             license: licence of the weights, such as ``apache-2.0``; as the data if None.
-            card: ``name``, ``scores`` (test_scores.csv of ``facediff test``) and ``languages`` for the model card.
+            name: the model's name in the card; the folder's if None.
 
         Raises:
             FaceDiffError: if the folder is not empty or cannot be written.
         """
-        return self.module.save_pretrained(folder, half=half, license=license, **card)
+        return self.module.save_pretrained(folder, half=half, license=license, name=name)
 
     def __repr__(self) -> str:
         identities = f"identities {', '.join(self.identities)}"

@@ -59,8 +59,6 @@ USUAL_SWAY = 2.0
 """Degrees where no number is given."""
 Threads = Annotated[int, Range(0, 1024)]
 Tolerance = Annotated[float, Range(1e-15, 1)]
-USUAL_LOW_LATENCY_STEPS = 1500
-"""Steps in which an audio encoder is distilled for low latency."""
 
 USUAL_VOICE_STEPS = 600
 """Training steps in which an audio encoder learns other voices where no number is given."""

@@ -16,7 +16,7 @@ from facediff.errors import FaceDiffError
 @pytest.fixture
 def published(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     """A model folder, which knows its corpus but no folder of it."""
-    assert main(["publish", str(checkpoint), str(tmp_path / "published"), "--license", "mit", "--languages", "en"]) == 0
+    assert main(["publish", str(checkpoint), str(tmp_path / "published"), "--license", "mit"]) == 0
     capsys.readouterr()
     return tmp_path / "published"
 

@@ -11,11 +11,6 @@ import pytest
 from facediff.cli.app import main
 from facediff.utils.arrays import read_arrays
 
-SCORES = (
-    "split,method,unseen_identity,lve,protocol,frames,sequences\ntest_a,model,style_only,0.125,paper,33,2\n"
-    "test_a,still,style_only,0.25,paper,33,2\n"
-)
-
 
 @pytest.fixture(scope="module")
 def published(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -69,23 +64,6 @@ def test_commercial_only_refuses_what_is_not_cleared(
     assert main([*words, "--commercial-only"]) == 2
     assert "corpus tiny" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_scores_next_to_the_checkpoint_are_on_the_card_unless_older(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import os
-    import shutil
-
-    own = tmp_path / "model.ckpt"
-    shutil.copy(checkpoint, own)
-    (tmp_path / "test_scores.csv").write_text(SCORES)
-    assert main(["publish", str(own), str(tmp_path / "one")]) == 0
-    assert "| 0.125 |" in (tmp_path / "one" / "README.md").read_text()
-    os.utime(tmp_path / "test_scores.csv", (1, 1))
-    assert main(["publish", str(own), str(tmp_path / "two")]) == 0
-    assert "0.125" not in (tmp_path / "two" / "README.md").read_text()
-    assert "test_scores.csv" in capsys.readouterr().out
 
 
 @pytest.mark.slow

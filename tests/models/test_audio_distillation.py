@@ -1,4 +1,4 @@
-"""A distilled audio encoder gives the teacher's features of augmented or truncated speech; the rest stays."""
+"""A distilled audio encoder gives the teacher's features of augmented speech; the rest stays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import torch
 from facediff.data.augmentation import Augmenter, filtered, read_augmentations
 from facediff.errors import FaceDiffError
 from facediff.models.audio_distillation import (
-    LOW_LATENCY_DISTILLATION,
     DistillationOptions,
     SpeechPairs,
     distil_audio_encoder,
@@ -23,7 +22,6 @@ from facediff.models.audio_distillation import (
 )
 from facediff.models.base import AnimationModel
 from facediff.speech.audio import write_wav
-from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, WindowPlan
 from tests.fakes.tiny import Tiny
 
 FEW = DistillationOptions(steps=3, batch_size=2, workers=0)
@@ -140,7 +138,7 @@ def test_people_are_heard_in_their_share_of_the_pieces(tiny: Tiny, tmp_path: Pat
     options = replace(FEW, steps=20, batch_size=8, pauses=0, share=0, people=tmp_path, recorded_share=0.25)
     (speech,) = recordings = read_recordings(tmp_path, seed=0)
     np.testing.assert_allclose(speech, loud, atol=1e-4)
-    pairs = SpeechPairs(tiny, Augmenter([]), options, LOW_LATENCY_AHEAD, recordings)
+    pairs = SpeechPairs(tiny, Augmenter([]), options, recordings)
     lengths = torch.cat([pairs[index].lengths for index in range(len(pairs))])
     heard = (lengths == 4 * 16_000).float().mean()  # clips of the corpus are shorter
     assert heard == pytest.approx(0.25, abs=0.1)
@@ -151,71 +149,14 @@ def test_people_are_heard_in_their_share_of_the_pieces(tiny: Tiny, tmp_path: Pat
 def test_the_background_goes_on_where_the_teacher_hears_a_pause(tiny: Tiny) -> None:
     options = replace(FEW, extra_speech=0, pauses=1.0, share=1.0, steps=20)
     augmenter = Augmenter(read_augmentations(["music:share=1,least=6,most=6"]))
-    pairs = SpeechPairs(tiny, augmenter, options, LOW_LATENCY_AHEAD)
+    pairs = SpeechPairs(tiny, augmenter, options)
     pauses = 0
     for number in range(len(pairs)):
         batch = pairs[number]
-        for clean, student, length in zip(batch.clean, batch.student_input, batch.lengths.tolist(), strict=True):
+        for clean, student, length in zip(batch.clean, batch.augmented, batch.lengths.tolist(), strict=True):
             steps = length // 160
             quiet, heard = (each[: steps * 160].reshape(steps, 160).abs().amax(1) for each in (clean, student))
             paused = (quiet < 1e-3 * clean.abs().max()).numpy()
             pauses += paused.sum() >= 25  # steps of 10 ms
             assert float(heard[torch.from_numpy(paused)].mean()) > 0.01 * float(student.abs().max())
     assert pauses > 20
-
-
-@pytest.mark.parametrize(("whole", "windows"), [(0.0, LOW_LATENCY_AHEAD), (0.0, LOW_LATENCY), (1.0, LOW_LATENCY_AHEAD)])
-def test_a_student_hears_what_a_window_hears(tiny: Tiny, whole: float, windows: WindowPlan) -> None:
-    """Speech up to a moment after the frame and then silence, which is not compared."""
-    options = replace(FEW, extra_speech=0, pauses=0.0, share=0.0, steps=20, low_latency=True, complete_share=whole)
-    pairs = SpeechPairs(tiny, Augmenter([]), options, windows)
-    after, ahead = round(windows.after * 50), round(windows.ahead * 50)
-    for number in range(len(pairs)):
-        batch = pairs[number]
-        assert batch.mean is not None
-        assert batch.deviation is not None
-        rows = zip(
-            *(each.tolist() for each in (batch.teacher_steps[:, 0], batch.steps, batch.compared, batch.lengths)),
-            strict=True,
-        )
-        for row, (start, steps, (first, last), length) in enumerate(rows):
-            heard = steps if whole else steps - max(0, ahead - after)
-            clip, student = batch.clean[row, :length].numpy(), batch.student_input[row].numpy()
-            so_far = clip[: (start + heard) * 320]
-            np.testing.assert_array_equal(student[: heard * 320], so_far[start * 320 :])
-            assert float(batch.mean[row]) == pytest.approx(so_far.mean(), abs=1e-6)
-            assert float(batch.deviation[row]) == pytest.approx(max(so_far.std(), 0.003), rel=1e-4)
-            if whole:
-                assert (start, steps, first, last) == (0, length // 320, 0, steps)
-            else:
-                np.testing.assert_allclose(student[heard * 320 : steps * 320], so_far.mean(), atol=1e-6)
-                frame = heard - after
-                # Half a second before the frame; after it, as far as it is heard.
-                assert first == max(0, frame - 25)
-                assert last == (heard if ahead else frame)
-
-
-@pytest.mark.slow
-def test_speech_that_breaks_off_is_heard_as_the_whole(model: AnimationModel, tiny: Tiny) -> None:
-    """On test clips: the features of the last 0.12 s that have been heard are those of the whole."""
-    speech = [tiny.dataset("test_a")[index].audio.numpy() for index in range(4)]
-    wanted = [features(model, each) for each in speech]
-
-    def error() -> float:
-        found = []
-        for each, whole in zip(speech, wanted, strict=True):
-            for frames in (6, 9, 12, 15):
-                heard = each[: 640 * frames]
-                silent = np.pad(heard, (0, 640 * 10), constant_values=heard.mean())
-                count = torch.tensor([len(silent)])
-                level = model.speech_encoder.at_level(float(heard.mean()), float(heard.std()))
-                with torch.inference_mode(), level:
-                    made = model.speech_encoder(torch.from_numpy(silent[None]), count, count // 640)[0]
-                found.append((made[frames - 3 : frames] - whole[frames - 3 : frames]).square().flatten())
-        return float(torch.cat(found).mean())
-
-    before = error()
-    distil_audio_encoder(
-        model, tiny, replace(LOW_LATENCY_DISTILLATION, steps=60, batch_size=6, workers=0, learning_rate=3e-3)
-    )
-    assert error() < 0.85 * before

@@ -202,27 +202,6 @@ def test_the_best_checkpoint_is_chosen_by_energy_over_a_still_faces(
     assert scores["val/energy"] == pytest.approx((sums["model"] / sums["still"]).mean(), rel=1e-5)
 
 
-def test_test_scores_are_printed_and_written_by_attribute(
-    make_model: Make, tiny: Tiny, make_trainer: MakeTrainer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    trainer = make_trainer(callbacks=[ScoreTable()])
-    trainer.test(make_model(motion_scale="none", score_by=["mood"]), datamodule=tiny, verbose=False)
-    assert "\nby mood\n" in capsys.readouterr().out
-    with (tmp_path / "test_scores_by.csv").open() as stream:
-        groups = list(csv.DictReader(stream))
-    with (tmp_path / "test_sequences.csv").open() as stream:
-        clips = list(csv.DictReader(stream))
-    assert {row["mood"] for row in groups} == {"calm", "lively"}
-    for row in groups:
-        own = [clip for clip in clips if all(clip[name] == row[name] for name in ("split", "method", "mood"))]
-        frames = [int(clip["frames"]) for clip in own]
-        assert (int(row["sequences"]), int(row["frames"])) == (len(own), sum(frames))
-        assert float(row["lve"]) == pytest.approx(np.average([float(clip["lve"]) for clip in own], weights=frames))
-        assert float(row["fdd"]) == pytest.approx(np.mean([float(clip["fdd"]) for clip in own]))
-    with pytest.raises(FaceDiffError, match="score_by"):
-        make_trainer().test(make_model(motion_scale="none", score_by=["mod"]), datamodule=tiny, verbose=False)
-
-
 def test_mixed_precision_trains_with_clipped_gradients(make_model: Make, tiny: Tiny, make_trainer: MakeTrainer) -> None:
     model = make_model()
     before = model.network.unembed.weight.detach().clone()

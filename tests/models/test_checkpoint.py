@@ -22,8 +22,8 @@ from facediff.cli.app import main
 from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
+from facediff.models.base import build_model
 from facediff.models.checkpoint import corpus_of, read_checkpoint
-from facediff.models.loading import build_model
 from tests.fakes.tiny import Tiny
 
 Tree = Any

@@ -16,7 +16,7 @@ from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from facediff.models.decoders import Decoder
 from facediff.models.dual_path.conditioning import Conditions
-from facediff.models.folding import ConditionalDenoiser
+from facediff.models.dual_path.network import ConditionalDenoiser
 from tests.fakes.tiny import Tiny
 
 Make = Callable[..., DualPathDiffusion]

@@ -15,7 +15,8 @@ from facediff import registry
 from facediff.data import Batch, collate
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, folding
-from facediff.models.folding import ConditionalDenoiser, Fold, FoldedSpace, VertexSpace, WeightCache, fold
+from facediff.models.dual_path.network import ConditionalDenoiser
+from facediff.models.folding import Fold, FoldedSpace, VertexSpace, WeightCache, fold
 from tests.fakes.tiny import Tiny
 
 

@@ -183,36 +183,14 @@ def test_the_licence_of_the_weights_is_by_default_that_of_the_data(checkpoint: P
 # The card.
 
 
-def test_the_card_states_licence_data_and_scores_with_their_conditions(checkpoint: Path, tmp_path: Path) -> None:
-    table = tmp_path / "test_scores.csv"
-    table.write_text(
-        "split,method,unseen_identity,mve,lve,protocol,frames,sequences,lips_vertices,lips_hash\n"
-        "test_a,model,style_only,0.25,1e-3,paper,321,7,12,deadbeef\n"
-        "test_a,still,style_only,0.5,2e-3,paper,321,7,12,deadbeef\n"
-    )
-    folder = load_model(checkpoint).save_pretrained(
-        tmp_path / "card", license="cc-by-nc-4.0", name="ada/face", scores=table, languages=["de"]
-    )
+def test_the_card_states_licence_and_data(checkpoint: Path, tmp_path: Path) -> None:
+    folder = load_model(checkpoint).save_pretrained(tmp_path / "card", license="cc-by-nc-4.0", name="ada/face")
     _, head, body = (folder / "README.md").read_text().split("---\n", 2)
     found = yaml.safe_load(head)
     assert found["license"] == "cc-by-nc-4.0"
     assert found["library_name"] == "facediff"
-    assert found["language"] == ["de"]
     assert found["corpus"] == {"name": "tiny", "synthetic": True}
-    (result,) = found["model-index"][0]["results"]
-    assert {each["type"]: each["value"] for each in result["metrics"]} == {"mve": 0.25, "lve": 0.001}
-    assert result["dataset"]["args"]["lips_hash"] == "deadbeef"
-    for word in (
-        "ada/face",
-        "deadbeef",
-        "321",
-        "`paper`",
-        "ynthetic",
-        "Limits",
-        "Intended use",
-        "forbidden",
-        "corpus tiny",
-    ):
+    for word in ("ada/face", "ynthetic", "Limits", "Intended use", "forbidden", "corpus tiny"):
         assert word in body
 
 

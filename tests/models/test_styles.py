@@ -163,16 +163,6 @@ def test_a_take_brings_its_template_unit_and_frame_rate(
         style_from(str(tmp_path / "moving.npz"), "A", model)
 
 
-def test_the_median_stands_for_a_template_with_a_note(
-    unseen: tuple[Path, np.ndarray, np.ndarray], model: DualPathDiffusion, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, face, offsets = unseen
-    style = style_from(str(path), "A", model, template="median")
-    assert isinstance(style, Reference)
-    np.testing.assert_allclose(style.motion, offsets - np.median(offsets, axis=0), atol=2e-6)
-    assert "the median of its" in capsys.readouterr().out
-
-
 # Models of channels take motion in parameters.
 
 

@@ -62,7 +62,7 @@ CHANNELS: dict[str, Channel] = {
     # Of 1.x: they are read, and no longer followed.
     "condition": Channel(None, in_model=True),
     "expressivity": Channel(ranges.EXPRESSIVITY, regions=True, in_model=True),
-    "guidance": Channel(ranges.GUIDANCE_SCALE, parts=("audio", "style"), in_model=True),
+    "guidance": Channel(ranges.GUIDANCE_SCALE, parts=("speech", "identity", "style"), in_model=True),
     "expressiveness": Channel(Range(0, 4), regions=True),
     "acting": Channel(Range(0, 2)),
     "shape": Channel(Range(-1, 1), parts=ARKIT),  # weights that are added to the motion

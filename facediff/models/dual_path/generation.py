@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -12,8 +11,9 @@ from torch import Tensor
 
 from facediff.data import Batch
 from facediff.models.dual_path.conditioning import Conditions
+from facediff.models.dual_path.network import ConditionalDenoiser
 from facediff.models.dual_path.recipe import DualPathRecipe
-from facediff.models.folding import Blend, ConditionalDenoiser, unchanged
+from facediff.models.folding import Blend, unchanged
 from facediff.models.inference import ClipNoise, Progress, WindowNoise, WindowOverlap
 from facediff.models.samplers import NoiseSource
 from facediff.speech.windows import MotionWindow
@@ -133,7 +133,7 @@ class Generation(DualPathRecipe):
 
     def empty_state(self, denoiser: ConditionalDenoiser) -> Tensor:
         """A state with no values yet."""
-        shape = (*cast(Conditions, denoiser.conditions).mask.shape, denoiser.width)
+        shape = (*denoiser.conditions.mask.shape, denoiser.width)
         return torch.empty(shape, device=self.device, dtype=next(self.parameters()).dtype)
 
     def decode(

@@ -33,7 +33,7 @@ from facediff.models.dual_path.conditioning import Conditions
 from facediff.models.dual_path.generation import Generation
 from facediff.models.dual_path.graphs import graphs_of
 from facediff.models.dual_path.network import DualPathNetwork
-from facediff.models.dual_path.objective import objective_of
+from facediff.models.dual_path.objective import ComponentObjective, TrainingObjective, VertexObjective
 from facediff.models.dual_path.options import DualPathOptions
 from facediff.models.folding import Blend, unchanged
 from facediff.models.graphs import Graphs
@@ -105,7 +105,7 @@ class DualPathDiffusion(Generation):
         # Several noisy versions of a clip share its conditions: they lower the variance of the gradient at the price of
         # the denoising network alone.
         draws = len(step) // len(batch)
-        objective = objective_of(self, batch, step, draws)
+        objective = self.objective(batch, step, draws)
         conditions = self.conditions(batch)  # ④ F_a, F_dyn, F_id
         noisy = objective.inputs(noise)  # ③ Mⁿ by eq. 1
         motion = self.network.embed(noisy)  # ⑤ F_m
@@ -117,6 +117,17 @@ class DualPathDiffusion(Generation):
             total = losses["loss"] + self.options.style_identity_weight * term
             losses |= {"style_identity": term, "loss": total}
         return losses
+
+    def objective(self, batch: Batch, step: Int[Tensor, " draws"], draws: int) -> TrainingObjective:
+        """The objective of the motion space for so many draws of every clip."""
+        motion, mask, scales = batch.motion, batch.mask, self.motion_space.preconditioning
+        if scales is not None:
+            motion = self.motion_space.encode(self.scaled(motion))
+        if draws > 1:
+            motion, mask = motion.repeat_interleave(draws, 0), mask.repeat_interleave(draws, 0)
+        if scales is None:
+            return VertexObjective(self, motion, mask, step)
+        return ComponentObjective(self, motion, mask, step, scales)
 
     # Algorithm 2: sampling.
 

@@ -9,9 +9,10 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from facediff.errors import FaceDiffError
 from facediff.models.dual_path.conditioning import (
     ConditionEncoding,
     Conditions,
@@ -23,13 +24,18 @@ from facediff.models.dual_path.options import DualPathOptions
 from facediff.models.dual_path.speech_style import SpeechStyle
 from facediff.models.folding import (
     Blend,
-    ConditionalDenoiser,
     Fold,
-    PreconditionedDenoiser,
+    FoldedSpace,
+    State,
+    Step,
+    VertexSpace,
+    WantedMotion,
     WeightCache,
     fold,
+    step_of_rows,
     unchanged,
 )
+from facediff.models.layers import Frames
 from facediff.models.motion_space import MotionSpace, Preconditioning
 
 TRUNK = (
@@ -207,3 +213,97 @@ class StepEmbedding(nn.Module):
         # Wavelengths from 2π to 2π · 10 000 steps, so that near and far steps differ in some channel.
         angle = step[:, None].float() * self.frequencies
         return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
+
+
+# The network as a sampler sees it.
+
+
+class ConditionalDenoiser:
+    """A network under conditions, in a space in which a sampler runs without knowing which; made for one run.
+
+    Args:
+        network: predicts clean motion.
+        conditions: its conditions, with everything else that is constant over the denoising steps.
+        fold: the products of the network's ends, to run in their width; None to run on the vertices.
+        blend: changes the features that the network gives in every step.
+    """
+
+    def __init__(
+        self,
+        network: DualPathNetwork,
+        conditions: Conditions,
+        fold: Fold | None = None,
+        blend: Blend = unchanged,
+    ) -> None:
+        self.network = network
+        self.conditions = conditions
+        self.space: VertexSpace | FoldedSpace
+        if fold is None:
+            self.space = VertexSpace(network.embed, network.clean_motion, network.coordinates)
+        else:
+            self.space = FoldedSpace(network.embed, fold)
+        self.width = self.space.width
+        self.blend = blend
+        self._last: tuple[Tensor, Tensor] | None = None  # features and prediction of the latest step, if folded
+
+    def features(self, embedded: Frames, step: Step) -> Frames:
+        """The network's last features of embedded noisy motion, at a step counted from 0."""
+        return self.network.core(embedded, step_of_rows(step, embedded), self.conditions)
+
+    def noise(self, unit: State) -> State:
+        """From independent unit Gaussian noise to the image of unit Gaussian noise on vertices."""
+        return self.space.noise(unit)
+
+    def denoise(self, state: State, step: Step) -> State:
+        """The image of the predicted clean motion M̂⁰."""
+        features = self.blend(self.features(self.space.embed(state), step))
+        prediction = self.space.clean(features)
+        if isinstance(self.space, FoldedSpace):
+            self._last = features, prediction
+        return prediction
+
+    def motion(self, sample: State, frames: slice = slice(None)) -> WantedMotion:  # noqa: B008
+        """Scaled motion of the sampler's result in some frames; where folded, the only map to the vertices."""
+        if not isinstance(self.space, FoldedSpace):
+            return sample[:, frames]
+        # y alone does not say where the vertices are. But the last step of a linear sampler returns the last prediction
+        # E M̂⁰, and M̂⁰ = U h + b of the features h that the network gave for it, which were kept.
+        if self._last is None or not torch.allclose(sample, self._last[1], rtol=1e-3, atol=1e-4, equal_nan=True):
+            raise FaceDiffError(
+                "sampler: it is declared linear, but its last step does not return the last prediction; "
+                "choose --model.sampling_space=vertices"
+            )
+        return self.network.clean_motion(self._last[0][:, frames])
+
+
+class PreconditionedDenoiser(ConditionalDenoiser):
+    """Coordinates of motion with known variances; the network predicts the part that the noisy motion leaves open.
+
+    Args:
+        network: predicts that.
+        conditions: as :class:`ConditionalDenoiser` takes them.
+        preconditioning: the scales around the network.
+        mask: True on valid frames, one row for each row of the state.
+        blend: changes the predictions of every step.
+    """
+
+    def __init__(
+        self,
+        network: DualPathNetwork,
+        conditions: Conditions,
+        preconditioning: Preconditioning,
+        mask: Bool[Tensor, "batch frames"],
+        blend: Blend = unchanged,
+    ) -> None:
+        super().__init__(network, conditions, None, blend)
+        self.preconditioning = preconditioning
+        self.mask = mask
+
+    def denoise(self, state: State, step: Step) -> State:
+        """M̂⁰."""
+        scales, steps = self.preconditioning, step_of_rows(step, state)
+        # The state stays as it is and only the network's input is scaled: samplers know nothing of preconditioning.
+        mean = scales.posterior_mean(state, steps, self.mask)
+        features = self.features(self.network.embed(scales.inputs(state, mean, steps, self.mask)), step)
+        # The prediction is blended, not the features: the noisy motion is a part of it.
+        return self.blend(scales.clean(mean, self.network.clean_motion(features), steps, self.mask))

@@ -197,7 +197,7 @@ class CodeTalker(AutoregressiveModel):
         Args:
             path: a checkpoint of either stage, a model folder, or a name of the Hugging Face hub.
         """
-        from facediff.models.loading import load_model
+        from facediff.models.base import load_model
         from facediff.utils.licences import merged
 
         if path is None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from facediff.data import Batch, Reference, SpeechMotionDataModule
 from facediff.errors import OptionError
-from facediff.models.checkpoint_content import PersonStyles
+from facediff.models.checkpoint_content import CheckpointContent
 from facediff.models.evaluation import IdentityPolicy
 from facediff.models.inference import Style
 from facediff.models.layers import Heads, Layers, Width, check_heads
@@ -118,12 +118,12 @@ class ParametricModel(PublishedModel):
 
     def styled_identities(self) -> list[str]:
         """The speakers with a stored style."""
-        return PersonStyles.styled_identities(self)
+        return CheckpointContent.styled_identities(self)
 
     def default_style(self, identity: str) -> Reference | Style:
         """The person's style or the stored reference; no style, as the models train to do without, if there is none."""
         if identity in self.person_styles or identity in self.assets.references:
-            return PersonStyles.default_style(self, identity)
+            return CheckpointContent.default_style(self, identity)
         return NO_STYLE
 
     def standardised(self, motion: Float[Tensor, "batch frames points dims"]) -> Float[Tensor, "batch frames channels"]:
