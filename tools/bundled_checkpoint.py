@@ -28,7 +28,6 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from facediff.callbacks.checkpoints import AtomicCheckpointIO
-from facediff.cli.adapt import TRAINING_STATE
 from facediff.cli.generation_metrics import corpus_of_checkpoint
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
@@ -43,6 +42,11 @@ WITHOUT = ("network.no_style", "style_identity.", "network.speech_style.")
 """Weights that no graph holds: they are for training, or are gathered anew."""
 ROUNDED = 2e-3
 """Largest relative difference that 16 bits leave of a number."""
+TRAINING_STATE = (
+    *("optimizer_states", "lr_schedulers", "loops", "callbacks"),
+    *("facediff_training_state", "current_model_state", "averaging_state"),
+)
+"""Entries of a checkpoint from which its training would continue."""
 SAME = 0.02
 """Share of the motion's range by which the two may differ."""
 SEARCH = 1000

@@ -29,8 +29,8 @@ Array = npt.NDArray[np.float32]
 S = TypeVar("S")
 """A model's kind of style."""
 
-PARAMETER_FILES = (".csv", ".json", ".npy", ".npz", ".pt")
-"""Suffixes of motion in parameters; ``.pt`` are ARTalk's style clips, which need PyTorch."""
+PARAMETER_FILES = (".csv", ".json", ".npy", ".npz")
+"""Suffixes of motion in parameters."""
 FILES = (".npy", ".npz")
 """Suffixes of files that hold a style; anything else is the name of a clip."""
 CANCELLED = 1e-3
@@ -200,8 +200,6 @@ def recorded_parameters(source: str, frame_rate: float) -> ParameterClip | None:
         return None
     if not path.is_file():
         raise OptionError.naming(f"{{style}} {path}: no such file")
-    if path.suffix == ".pt":
-        raise OptionError.naming(f"{{style}} {path}: is read by checkpoints only; give the clip as .npy@LAYOUT")
     if path.suffix == ".npz" and stated is None and "template" in read_arrays(path, {"template"}):
         animation = read_archive(path)
         if animation.values is None:

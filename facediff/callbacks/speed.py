@@ -41,7 +41,7 @@ class SpeechFeatureCache(Callback):
         if key is None:
             raise FaceDiffError(
                 f"SpeechFeatureCache: {type(model).__name__} encodes random pieces of the speech, or its audio encoder "
-                f"{type(encoder).__name__} has no frozen part (or spec_augment is on); omit the callback, or use an "
+                f"{type(encoder).__name__} has no frozen part; omit the callback, or use an "
                 f"encoder with one, e.g. --model.audio_encoder=hubert"
             )
         features = CachedFeatures(ArrayStore(self.folder), f"{key}:{trainer.precision}")

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from facediff import registry
 from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder, prepared
 from facediff.cli.options import Checkpoint, CheckpointFile, Corpus, Folder, Seed
 from facediff.cli.process import confirm_cost, tell
-from facediff.errors import FaceDiffError, refuse_idle
+from facediff.errors import FaceDiffError
 from facediff.utils import ranges
 from facediff.utils.hub import check_model_source, model_name
 from facediff.utils.option import Option
@@ -28,21 +27,20 @@ Mode = Literal["finetune", "joint"]
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Training on a person or a face.
+    """Training on a person.
 
     Attributes:
         mode: train on the new speaker's clips only (finetune), or on theirs among all others' (joint)
-        train: all weights, identity and style only (person), or the face only (head); by
-            default all with --person, and head with --face
+        train: all weights, or identity and style only (person)
         epochs: epochs over the training clips
         learning_rate: falls to 0 as a cosine
         yes: start without a question, however long it takes
     """
 
     mode: Annotated[Mode, Option(needs="person")] = "finetune"
-    train: Annotated[Literal["all", "person", "head"] | None, Option(needs="person face")] = None
-    epochs: Annotated[ranges.Epochs, Option(metavar="N", needs="person face")] = 60
-    learning_rate: Annotated[ranges.LearningRate, Option(metavar="RATE", needs="person face")] = 5e-4
+    train: Annotated[Literal["all", "person"], Option(needs="person")] = "all"
+    epochs: Annotated[ranges.Epochs, Option(metavar="N", needs="person")] = 60
+    learning_rate: Annotated[ranges.LearningRate, Option(metavar="RATE", needs="person")] = 5e-4
     yes: bool = False
 
 
@@ -67,8 +65,7 @@ class EncoderOptions:
 def adapt(
     *,
     checkpoint: Checkpoint,
-    person: Annotated[str | None, Option(metavar="DIR", reads=True, without="face voices")] = None,
-    face: Annotated[str | None, Option(metavar="CORPUS", without="voices corpus")] = None,
+    person: Annotated[str | None, Option(metavar="DIR", reads=True, without="voices")] = None,
     voices: Annotated[ranges.Steps | None, Option(metavar="STEPS", bare=ranges.USUAL_VOICE_STEPS)] = None,
     output: CheckpointFile,
     data_root: Folder = None,
@@ -80,18 +77,16 @@ def adapt(
     encoder: EncoderOptions,
     licence: LicenceOptions,
 ) -> None:
-    """Fine-tune a checkpoint on a new speaker or a new face, or adapt its audio encoder to voices.
+    """Fine-tune a checkpoint on a new speaker, or adapt its audio encoder to voices.
 
-    With --person, the model is trained on a minute of the new speaker's motion, and knows them by name. With --face, a
-    dual-path model gets a new head for another topology, or for channels, from a minute of motion. With --voices, its
-    audio encoder is distilled to be robust to other voices, rooms and noise. The corpus that the checkpoint was trained
-    on must be on this machine.
+    With --person, the model is trained on a minute of the new speaker's motion, and knows them by name. With --voices,
+    its audio encoder is distilled to be robust to other voices, rooms and noise. The corpus that the checkpoint was
+    trained on must be on this machine.
 
     Args:
         checkpoint: trained model (.ckpt)
         person: folder that `facediff data import-person` wrote, or the name of a speaker of the corpus who was not
             trained on and has clips that belong to no split
-        face: corpus of another face, by its registered name or as package.module.Class; --data-root is its folder
         voices: distil the audio encoder to be robust to other voices, rooms and noise, in so many steps (600 if no
             number)
         output: checkpoint to write (.ckpt)
@@ -101,7 +96,7 @@ def adapt(
         seed: seed of all random numbers
         accelerator: Lightning's: auto, cpu, gpu …
         quiet: no progress bar
-        training: how the model learns a person or a face.
+        training: how the model learns a person.
         encoder: how the audio encoder is distilled.
         licence: which models are refused.
     """
@@ -119,24 +114,17 @@ def adapt(
         )
         device = {"gpu": "cuda"}.get(accelerator, accelerator)
         report = adapt_audio_encoder(checkpoint, output, where, device, licence, options, quiet=quiet)
-    elif person is None and face is None:
-        raise FaceDiffError(
-            "--person, --face, --voices: expected one of them: a new speaker, another face, or robustness to other "
-            "voices"
-        )
+    elif person is None:
+        raise FaceDiffError("--person, --voices: expected one of them: a new speaker, or robustness to other voices")
     else:
-        train = training.train or ("all" if face is None else "head")
-        refuse_idle("head is for {face}", train=train == "head" and face is None)
-        training = replace(training, train=train)
-        report = train_on(checkpoint, output, person, face, where, training, licence, accelerator, seed, quiet=quiet)
+        report = train_on(checkpoint, output, person, where, training, licence, accelerator, seed, quiet=quiet)
     tell(f"{output}: {report.format(seconds=time.monotonic() - started)}")
 
 
 def train_on(
     checkpoint: Path,
     output: Path,
-    person: str | None,
-    face: str | None,
+    person: str,
     where: tuple[Path | None, str | None],
     options: TrainingOptions,
     licence: LicenceOptions,
@@ -145,13 +133,13 @@ def train_on(
     *,
     quiet: bool,
 ) -> str:
-    """Write a checkpoint that knows a new person or face; the report has ``{seconds}`` to fill in."""
+    """Write a checkpoint that knows a new person; the report has ``{seconds}`` to fill in."""
     from lightning.pytorch import Trainer, seed_everything
 
     from facediff.callbacks.checkpoints import AtomicCheckpointIO, requeue_on_signal, slurm_plugins
     from facediff.cli.lightning import exit_statuses
     from facediff.cli.lightning_cli import IDLE_WARNINGS, without_warnings
-    from facediff.models.adaptation import train_only, with_extra_identities, with_new_face
+    from facediff.models.adaptation import train_only, with_extra_identities
     from facediff.models.base import build_model
     from facediff.models.checkpoint import read_checkpoint
     from facediff.models.checkpoint_content import IMPORTED
@@ -159,17 +147,13 @@ def train_on(
     from facediff.utils.progress import on_terminal
 
     content = read_checkpoint(checkpoint)
-    if person is not None:
-        name, data = adaptation_data(checkpoint, content, person, options.mode, *where)
-    else:
-        data = corpus_of_face(str(face), where[0])
-        name = data.identities[0]
+    name, data = adaptation_data(checkpoint, content, person, options.mode, *where)
     model = build_model(checkpoint, content)
     if licence.commercial_only:
         require_cleared(checkpoint, model.licences)
     prepared(data)
     clips = data.clips("train")
-    if person is not None and not any(clip.identity == name for clip in clips):
+    if not any(clip.identity == name for clip in clips):
         speakers = ", ".join(sorted(data.corpus.templates))
         raise FaceDiffError(
             f"--person {person}: neither a person's folder nor a speaker with clips outside the test splits; the "
@@ -177,12 +161,12 @@ def train_on(
         )
     confirm_cost(options.yes, "--epochs", seconds=CLIP_SECONDS * options.epochs * len(clips))
     seed_everything(seed, verbose=False)
-    model = with_extra_identities(model, list(data.identities)) if face is None else with_new_face(model, data)
+    model = with_extra_identities(model, list(data.identities))
     imported = {key: value for key, value in model.provenance.items() if key == IMPORTED}
     model.provenance = {**imported, "parent": model_name(checkpoint)}
     model.learning_rate, model.lr_schedule, model.warmup_steps = options.learning_rate, "cosine", 0
     model.parameter_groups = None
-    train_only(model.train(), options.train or "all")
+    train_only(model.train(), options.train)
     trainer = Trainer(
         max_epochs=options.epochs,
         accelerator=accelerator,
@@ -201,11 +185,11 @@ def train_on(
     for parameter in model.parameters():
         parameter.requires_grad_(True)
     trainer.save_checkpoint(output, weights_only=False)
-    seconds = sum(data.corpus.frames(clip) for clip in clips if face or clip.identity == name) / data.frame_rate
+    seconds = sum(data.corpus.frames(clip) for clip in clips if clip.identity == name) / data.frame_rate
     # Pictures need a mesh, which a corpus may lack.
     target = "speech.npz" if model.assets.faces is None else "speech.mp4"
     command = ["facediff", "animate", "speech.wav", "--checkpoint", str(output), "--identity", name, "-o", target]
-    return f"adapted to {face or name} by {seconds:.0f} s of motion, in {{seconds:.0f}} s; next: {shlex.join(command)}"
+    return f"adapted to {name} by {seconds:.0f} s of motion, in {{seconds:.0f}} s; next: {shlex.join(command)}"
 
 
 def adapt_audio_encoder(
@@ -263,22 +247,6 @@ def write_distilled(
             content[key] = {**content[key], **weights}
     AtomicCheckpointIO().save_checkpoint(content, output)
     return error
-
-
-def corpus_of_face(face: str, root: Path | None) -> SpeechMotionDataModule:
-    """The data module of ``--face``, with default options."""
-    from facediff.cli.data import find_own_module
-    from facediff.data.check.layouts import by_name
-
-    find_own_module(face)
-    module: type[SpeechMotionDataModule] = by_name(face, None, "--face") if "." in face else registry.corpus.get(face)
-    if root is not None:
-        module.check_root(root)
-    try:
-        data: SpeechMotionDataModule = module(**{} if root is None else {"root": str(root)})
-    except TypeError as error:
-        raise FaceDiffError(f"--face {face}: give the corpus's folder with --data-root") from error
-    return data
 
 
 def adaptation_data(

@@ -18,7 +18,6 @@ def publish(
     folder: Annotated[Path, Option(metavar="FOLDER", writes="folder", new=True)],
     *,
     license: Annotated[str | None, Option(metavar="NAME")] = None,
-    half: bool = False,
     name: Annotated[str | None, Option(metavar="NAME")] = None,
     push: Annotated[str | None, Option(metavar="USER/NAME")] = None,
     private: Annotated[bool, Option(needs="push")] = False,
@@ -32,14 +31,13 @@ def publish(
 
     For example:
       facediff publish demo/puppet.ckpt puppet --license apache-2.0
-      facediff publish demo/puppet.ckpt puppet --half --push ada/puppet
+      facediff publish demo/puppet.ckpt puppet --push ada/puppet
       facediff animate speech.wav --checkpoint ada/puppet -o speech.mp4
 
     Args:
         checkpoint: trained model (.ckpt), a model folder, or user/name[@revision] of the hub
         folder: new folder to write
         license: licence of the weights, such as apache-2.0 or cc-by-nc-4.0 (default: the data's)
-        half: store the weights in 16 bits: half as large; the motion differs a little
         name: the model's name on the card (default: from --push, else the folder's)
         push: send the folder to this name on the hub; log in with `hf auth login` before
         private: with --push: a new model is visible to its owner alone
@@ -55,7 +53,7 @@ def publish(
 
     model = load_model(checkpoint, commercial_only=licence.commercial_only)
     model.provenance = {"published_from": hub.model_name(checkpoint), **model.provenance}
-    model.save_pretrained(folder, half=half, license=license, name=name or push)
+    model.save_pretrained(folder, license=license, name=name or push)
     labels = in_words(published_licences(model.licences, license))
     size = sum(path.stat().st_size for path in folder.iterdir())
     weights = (folder / hub.WEIGHTS).stat().st_size

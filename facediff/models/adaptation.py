@@ -1,4 +1,4 @@
-"""Adapting a trained model to a new speaker, by a row more in its identity table, or to a new face, by a new head."""
+"""Adapting a trained model to a new speaker, by a row more in its identity table."""
 
 from __future__ import annotations
 
@@ -9,23 +9,17 @@ import torch
 from lightning.pytorch.cli import instantiate_module
 from torch import Tensor
 
-from facediff.data import SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY
 from facediff.errors import FaceDiffError
-from facediff.models.base import SIZES, AnimationModel
+from facediff.models.base import AnimationModel
 from facediff.models.dual_path import DualPathDiffusion
 
-Part = Literal["all", "person", "head"]
-"""Trained parameters: all, only those that hold identity and style, or only those that belong to one face."""
+Part = Literal["all", "person"]
+"""Trained parameters: all, or only those that hold identity and style."""
 
 
 def with_extra_identities(model: AnimationModel, identities: list[str]) -> AnimationModel:
-    """The same model with further identities in front of those it was trained on, each starting as the mean of them.
-
-    Args:
-        model: a trained model.
-        identities: the new list of identities; the model's own must be its end.
-    """
+    """The same model with further identities in front of those it was trained on, each starting as the mean of them."""
     trained = model.identities
     count = len(identities) - len(trained)
     if count < 0 or identities[count:] != trained:
@@ -47,34 +41,10 @@ def with_extra_identities(model: AnimationModel, identities: list[str]) -> Anima
     return grown
 
 
-def with_new_face(model: AnimationModel, data: SpeechMotionDataModule) -> AnimationModel:
-    """A model of another face with the trunk of a trained dual-path model, and a head that knows nothing yet."""
-    if not isinstance(model, DualPathDiffusion):
-        raise FaceDiffError(
-            f"--face: {type(model).__name__} has no trunk that other faces could share; expected a checkpoint of "
-            f"DualPathDiffusion or ManyFaces"
-        )
-    shared = {key: value for key, value in model.hparams.items() if key not in SIZES and not key.startswith("_")}
-    shared.pop("faces", None)
-    sizes = {name: getattr(data, name) for name in SIZES}
-    face: DualPathDiffusion = instantiate_module(DualPathDiffusion, {**shared, **sizes})
-    face.network.share_trunk(model.network)
-    face.adopt(data.assets().with_motion_scale(data.motion_scale()))
-    face.attach_mesh()
-    face.measure(data)
-    face.scale_like(model, data)
-    face.licences = model.licences
-    return face
-
-
 def grow(before: Tensor, after: Tensor) -> Tensor:
     """``before`` with as many rows as ``after``, the new ones in front and equal to the mean of the old ones."""
     if before.shape == after.shape:
         return before
-    if before.shape[1:] != after.shape[1:] or len(before) > len(after):
-        raise FaceDiffError(
-            f"weights of the shape {tuple(before.shape)} have no row for each identity, so none can be added"
-        )
     # New rows come first, as new identities do in the list. Starting from the mean, fine-tuning takes fewer steps than
     # from noise, and no known identity is preferred.
     mean = before.mean(0, keepdim=True)
@@ -84,12 +54,6 @@ def grow(before: Tensor, after: Tensor) -> Tensor:
 def train_only(model: AnimationModel, part: Part) -> None:
     """Freeze everything but a part; ``all`` leaves everything as it is."""
     if part == "all":
-        return
-    if part == "head":
-        trunk = model.network.trunk() if isinstance(model, DualPathDiffusion) else []
-        shared = {id(parameter) for parameter in trunk}
-        for parameter in model.parameters():
-            parameter.requires_grad_(id(parameter) not in shared and parameter.requires_grad)
         return
     trained = {id(p) for module in model.personal_modules() for p in module.parameters()}
     if not trained:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from facediff.errors import ArgumentError, FaceDiffError, needs_extra
-from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames
+from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames, longest
 from facediff.registry import audio_encoder
 from facediff.speech.cepstra import mel_filters
 from facediff.speech.windows import CONVOLUTIONS, convolved
@@ -196,7 +196,6 @@ class MelEncoder(AudioEncoder):
     strided convolution and interpolated to the motion's frame rate at the end.
 
     Args:
-        dim: channels of the result; given by the model.
         hidden_dim: channels of the convolutions.
         num_layers: residual blocks, with dilations 1, 2, 4, 1, 2, 4 …
         dropout: dropout in each block.
@@ -317,7 +316,6 @@ class HubertEncoder(FrozenEncoder):
     so that their result can be kept on disk.
 
     Args:
-        dim: channels of the result; given by the model.
         source: a name on the Hugging Face hub or a directory that ``from_pretrained`` reads.
         frozen_layers: Transformer layers kept frozen, together with the convolutions, the feature projection and the
             position convolution below them; −1 freezes all.
@@ -345,6 +343,8 @@ class HubertEncoder(FrozenEncoder):
         super().__init__()
         self.hubert: Any = load_typed(source, config, "Model", "HuBERT", ("hubert",), encoder="hubert")
         self.train_projection = train_projection
+        # SpecAugment masks the input of the first layer at random, and what is trained changes in every step.
+        self.only_convolutions = train_projection or spec_augment
         self.hubert.config.apply_spec_augment = spec_augment
         self.hubert.config.layerdrop = layer_drop
         self.frozen_layers = frozen_depth(self.hubert, frozen_layers)
@@ -378,9 +378,7 @@ class HubertEncoder(FrozenEncoder):
         return self
 
     def frozen_key(self) -> str | None:
-        """A hash of the frozen weights, the configuration and the number of frozen layers; None with SpecAugment."""
-        if self.hubert.config.apply_spec_augment:
-            return None
+        """A hash of the frozen weights, the configuration and the number of frozen layers."""
         parts = {name: self.hubert.get_submodule(name) for name in self._frozen}
         return fingerprint(self.frozen_layers, self.hubert.config.to_dict(), parts)
 
@@ -389,36 +387,22 @@ class HubertEncoder(FrozenEncoder):
         return by_length(self.standardise(audio, audio_lengths), audio_lengths, self._lower)
 
     def _lower(self, wave: Tensor) -> Tensor:
-        """What no gradient reaches: convolutions, and a frozen projection with the frozen layers above it."""
+        """Convolutions, and a frozen projection with the frozen layers above it."""
         features = self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2)
-        if self.train_projection:
+        if self.only_convolutions:
             return features
         hidden = self.hubert.feature_projection(features)
         return transformer(self.hubert, hidden, 0, self.frozen_layers) if self.frozen_layers else hidden
 
     def _upper(self, hidden: Tensor) -> Tensor:
         """The rest."""
-        if self.train_projection:
-            hidden = self.hubert.feature_projection(hidden)
-        return transformer(self.hubert, hidden, 0 if self.train_projection else self.frozen_layers)
+        if not self.only_convolutions:
+            return transformer(self.hubert, hidden, self.frozen_layers)
+        return transformer(self.hubert, spec_augmented(self.hubert, self.hubert.feature_projection(hidden)))
 
     def trained(self, features: Features, lengths: Lengths) -> tuple[Tensor, Lengths]:
         """The last hidden states."""
         return by_length(features, lengths, self._upper)
-
-    def states(
-        self, audio: Waves, audio_lengths: Lengths, features: Features | None, feature_lengths: Lengths | None
-    ) -> tuple[Tensor, Lengths]:
-        """The last hidden states."""
-        # SpecAugment masks the input of the first layer at random, so that nothing below the trained layers can be
-        # cached.
-        if self.hubert.config.apply_spec_augment:
-            return by_length(self.standardise(audio, audio_lengths), audio_lengths, self._whole)
-        return super().states(audio, audio_lengths, features, feature_lengths)
-
-    def _whole(self, wave: Tensor) -> Tensor:
-        features = self.hubert.feature_extractor(with_edges(wave)).transpose(1, 2)
-        return transformer(self.hubert, spec_augmented(self.hubert, self.hubert.feature_projection(features)))
 
 
 def frozen_depth(network: PreTrainedModel, frozen_layers: int) -> int:
@@ -462,8 +446,8 @@ def transformer(network: Any, hidden: Tensor, first: int = 0, last: int | None =
         elif related:
             hidden, bias = layer(hidden, position_bias=bias, **({} if large else {"index": number}))[:2]
         else:
-            hidden = layer(hidden)
-            hidden = hidden[0] if isinstance(hidden, tuple) else hidden
+            states: Any = layer(hidden)
+            hidden = states[0] if isinstance(states, tuple) else states
     return encoder.layer_norm(hidden) if large and last is None else hidden
 
 
@@ -495,17 +479,21 @@ def with_edges(wave: Waves) -> Float[Tensor, "batch padded"]:
     return nn.functional.pad(wave, (EDGE, EDGE + max(0, 400 - wave.shape[1] - 2 * EDGE)))
 
 
-def by_length(padded: Tensor, lengths: Tensor, encode: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Encode clips of equal length together, without their padding; the padded results and their lengths."""
+def by_length(padded: Tensor, lengths: Tensor, encode: Callable[..., Tensor], *counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Encode clips of equal length (and counts) together, without their padding; the padded results and their lengths.
+
+    ``encode`` takes the clips, and a number of each of ``counts``.
+    """
     if exporting():
-        encoded = encode(padded)  # graphs take clips of one length, see ``takes_padding``
+        encoded = encode(padded, *map(longest, counts))  # graphs take clips of one length, see ``takes_padding``
         return encoded, torch.full_like(lengths, 1) * encoded.shape[1]
-    # HuBERT normalises over time, so padding would change its features.
+    # The networks attend to all of a clip without a mask, and normalise over time: padding would change every step.
     parts: dict[int, Tensor] = {}
-    for length in sorted(set(lengths.tolist())):
-        rows = (lengths == length).nonzero().flatten()
-        parts.update(zip(rows.tolist(), encode(padded[rows, :length]), strict=True))
-    ordered = [parts[i] for i in range(len(padded))]
+    keys = list(zip(*(numbers.tolist() for numbers in (lengths, *counts)), strict=True))
+    for key in sorted(set(keys)):
+        rows = [row for row, each in enumerate(keys) if each == key]
+        parts.update(zip(rows, encode(padded[rows, : key[0]], *key[1:]), strict=True))
+    ordered = [parts[row] for row in range(len(padded))]
     steps = torch.tensor([len(part) for part in ordered], device=padded.device)
     return nn.utils.rnn.pad_sequence(ordered, batch_first=True), steps
 
@@ -531,7 +519,6 @@ class CtcEncoder(FrozenEncoder):
     second). The 50 steps a second are interpolated to the motion's frames, or kept where a model asks for 50 a second.
 
     Args:
-        dim: channels of the result, a linear map of the logits; given by the model.
         source: a name on the Hugging Face hub or a directory that ``from_pretrained`` reads.
         config: the recogniser's configuration as plain data; if given, the weights are not read from ``source`` but
             left for a checkpoint to fill in. Checkpoints use it, so that they need no access to ``source``.
@@ -543,7 +530,7 @@ class CtcEncoder(FrozenEncoder):
         self, *, dim: Width, source: str = "facebook/wav2vec2-base-960h", config: dict[str, Any] | None = None
     ) -> None:
         super().__init__()
-        self.recogniser = load_recogniser(source, config)
+        self.recogniser = load_typed(source, config, "ForCTC", "recogniser with a CTC head", encoder="ctc")
         self.recogniser.requires_grad_(False)
         self.train()
         self.out = nn.Linear(self.recogniser.config.vocab_size, dim)
@@ -580,11 +567,6 @@ SOURCE = "audio_encoder.source"
 """The option that says where a pretrained network comes from, unless a model has one more."""
 
 
-def load_recogniser(source: str, config: dict[str, Any] | None, option: str = SOURCE) -> PreTrainedModel:
-    """A network with a CTC head from a directory, from the hub, or from a plain configuration without weights."""
-    return load_typed(source, config, "ForCTC", "recogniser with a CTC head", encoder="ctc", option=option)
-
-
 def load_typed(
     source: str,
     config: dict[str, Any] | None,
@@ -595,17 +577,7 @@ def load_typed(
     encoder: str,
     option: str = SOURCE,
 ) -> PreTrainedModel:
-    """A network of the type in its own configuration, from a directory, the hub, or a configuration without weights.
-
-    Args:
-        source: the directory, or the name on the hub.
-        config: the configuration as plain data; None to read it from ``source``.
-        head: end of the names of transformers' classes.
-        what: the expected type of network, in errors.
-        kinds: types of :data:`NETWORKS` that it may be.
-        encoder: the audio encoder that needs it, in errors.
-        option: the option that ``source`` comes from, in errors.
-    """
+    """A network of the type in its own configuration, from a directory, the hub, or a configuration without weights."""
     with needs_extra("transformers", "train", f"the {encoder} audio encoder"):
         import transformers
     path = os.path.expanduser(source)

@@ -103,8 +103,7 @@ class AnimationModel(CheckpointContent, ABC):
         metrics: further metrics for validation and test, by name with their options, such as
             ``lip_warping_distance`` or ``temporal_misalignment:at=path``; see docs/metrics.md.
         unseen_identity: which identity unseen speakers are tested and predicted with: none, with their own style
-            (``style_only``), each training identity in turn with the mean of the scores (``each_seen``), or their own,
-            once the model is adapted to them (``adapted``).
+            (``style_only``), or each training identity in turn with the mean of the scores (``each_seen``).
         style_source: the style that speakers have in validation, test and prediction, and by default in animation: of
             one ``reference`` clip, or of all motion of the ``person`` outside the evaluated clips, as the mean of the
             style vectors of stretches of ``data.reference_frames``. Checkpoints then keep every speaker's vector.
@@ -529,7 +528,6 @@ class AnimationModel(CheckpointContent, ABC):
         self,
         folder: str | Path,
         *,
-        half: bool = False,
         license: str | None = None,  # noqa: A002 - the hub's word
         name: str | None = None,
     ) -> Path:
@@ -540,7 +538,6 @@ class AnimationModel(CheckpointContent, ABC):
 
         Args:
             folder: a folder that does not exist, or is empty.
-            half: store the parameters in 16 bits: half as large; the motion differs a little.
             license: licence of the weights, such as ``apache-2.0``; the data's if None.
             name: the model's name in the card; the folder's if None.
 
@@ -550,7 +547,7 @@ class AnimationModel(CheckpointContent, ABC):
         Example:
             >>> model.save_pretrained("talking-face", license="apache-2.0")  # doctest: +SKIP
         """
-        return publish(self, Path(folder), half=half, licence=license, name=name)
+        return publish(self, Path(folder), licence=license, name=name)
 
     @classmethod
     def load_from_checkpoint(

@@ -26,7 +26,6 @@ class BundledEncoder(MelEncoder):
     It has heard 109 voices, in noise and in rooms, so that a model of one person keeps up with other voices.
 
     Args:
-        dim: channels of the result; given by the model.
         frozen: train the convolutions only, and leave the encoder as it is.
         dropout: dropout in the convolutions.
     """

@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -24,11 +23,11 @@ from facediff.errors import FaceDiffError, OptionError, counted
 from facediff.hyperparameters import component_class, describe, plain
 from facediff.models.inference import Inference, Style
 from facediff.models.layers import frame_mask
-from facediff.registry import COMPONENTS, corpus
+from facediff.registry import COMPONENTS
 from facediff.spaces import Space
 from facediff.speech.voice_activity import OFF, USUAL_GATE
 from facediff.utils.hints import defaults, is_name
-from facediff.utils.licences import LICENCES_KEY, Licence, merged, network_licences, read_licences
+from facediff.utils.licences import LICENCES_KEY, Licence, merged, read_licences
 from facediff.utils.limits import quoted
 
 PROVENANCE_KEY = "facediff_provenance"
@@ -51,20 +50,7 @@ MotionScale = Literal["unit", "none"]
 
 
 class CheckpointContent(LightningModule, Inference):
-    """The part of a model that a checkpoint keeps besides its weights.
-
-    Attributes:
-        n_vertices: points of the motion: vertices, or channels.
-        space: what its numbers mean.
-        identities: training identities in the order of the identity index.
-        motion_scaling: as :class:`facediff.models.AnimationModel` takes ``motion_scale``.
-        data_source: class and place of the corpus.
-        data_options: options of its data module.
-        licences: labels of everything that the model has learnt from.
-        provenance: texts by name, see :data:`PROVENANCE_KEY`.
-        style_source: whether speakers' styles are kept.
-        person_styles: the styles by speaker.
-    """
+    """The part of a model that a checkpoint keeps besides its weights."""
 
     n_vertices: int
     space: Space
@@ -178,21 +164,10 @@ class CheckpointContent(LightningModule, Inference):
             self.adopt(Assets.from_state(checkpoint[ASSETS_KEY]))
             check_weights("the checkpoint", checkpoint.get("state_dict", {}), self.state_dict())
             self.data_source = checkpoint.get(DATA_SOURCE_KEY) or {}
-            self.licences = merged(self.licences, self._stated_licences(checkpoint))
+            self.licences = merged(self.licences, read_licences("its labels", checkpoint.get(LICENCES_KEY, [])))
             self.provenance = read_provenance(checkpoint)
             self.data_options = dict(checkpoint.get("datamodule_hyper_parameters") or {})
             self.person_styles = read_person_styles(checkpoint.get(STYLES_KEY, {}))
-
-    def _stated_licences(self, checkpoint: dict[str, Any]) -> tuple[Licence, ...]:
-        """A checkpoint's labels; of one without, written before there were labels, its corpus's labels by name."""
-        if LICENCES_KEY in checkpoint:
-            return read_licences("its labels", checkpoint[LICENCES_KEY])
-        corpora: list[type[Any]] = [entry.implementation for entry in corpus]
-        module = next((m for m in corpora if getattr(m, "corpus_name", None) == self.assets.corpus), None)
-        licence = Licence(f"corpus {self.assets.corpus}") if module is None else module.corpus_licence()
-        options = checkpoint.get("datamodule_hyper_parameters") or {}
-        people = [Licence(f"speaker {Path(str(folder)).name}") for folder in options.get("people") or []]
-        return merged([licence], people, network_licences(dict(self.hparams)))
 
     # The speakers' styles, of all their motion.
 
@@ -290,11 +265,7 @@ def read_person_styles(state: Mapping[str, tuple[str, Tensor]]) -> dict[str, Sty
 
 
 class StyleEncoding(nn.Module):
-    """A model's style encoder as a module, so that it can be called with other weights than the model has.
-
-    Args:
-        model: the model.
-    """
+    """A model's style encoder as a module, so that it can be called with other weights than the model has."""
 
     def __init__(self, model: CheckpointContent) -> None:
         super().__init__()

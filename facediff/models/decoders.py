@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from typing import Annotated, ClassVar, NamedTuple, Protocol, cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from facediff.errors import ArgumentError
 from facediff.models.layers import (
@@ -65,13 +64,7 @@ class DecoderFactory(Protocol):
 
 
 class DecoderConstants(NamedTuple):
-    """Constants of a clip's decoding, computed once for all steps.
-
-    Attributes:
-        tokens: what each block attends to: the style tokens, or the products of them that its attention needs.
-        mask: True on valid frames; None if nothing is padded.
-        rotation: rotary positions of all blocks.
-    """
+    """Constants of a clip's decoding, computed once for all steps."""
 
     tokens: Sequence[Tensor | PreparedTokens]
     mask: Tensor | None
@@ -83,8 +76,6 @@ class StyleTransformer(Decoder):
     """Rotary Transformer in which every block attends to the style tokens; not autoregressive.
 
     Args:
-        dim: channels; given by the model.
-        style_dim: channels of a style token; given by the model.
         num_layers: blocks.
         num_heads: attention heads; ``dim / num_heads`` must be even for the rotary positions.
         feed_forward_factor: hidden width of the feed-forward as a multiple of ``dim``.
@@ -177,20 +168,12 @@ PreparedTokens = TokenProducts | AttentionContext
 class TokenAttention(Attention):
     """Attention to a few tokens, with the query's map multiplied into the keys and the last map into the values."""
 
-    def forward(
-        self,
-        x: Frames,
-        context: Float[Tensor, "batch keys context_dim"] | PreparedTokens,
-        context_mask: Bool[Tensor, "batch keys"] | None = None,
-        rotation: Rotation | None = None,
-    ) -> Frames:
+    def forward(self, x: Frames, context: Float[Tensor, "batch keys context_dim"] | PreparedTokens) -> Frames:  # type: ignore[override]
         """Attend from ``x`` to all of ``context``, or to the result of :meth:`prepare` for it."""
         if isinstance(context, Tensor):
-            if context_mask is not None:
-                return super().forward(x, context, context_mask, rotation)
-            context = self.prepare(context, rotation)
+            context = self.prepare(context)
         if isinstance(context, AttentionContext):
-            return self.attend(self.queries(x, rotation), context)
+            return self.attend(self.queries(x), context)
         # One product for all heads; the softmax is over each head's own tokens.
         # The scores arrive with W_q, b_q and 1/√d in them, and the values with W_o, so that neither queries nor a last
         # map are computed. Heads lie side by side in one matrix.
@@ -198,15 +181,13 @@ class TokenAttention(Attention):
         weights = scores.view(*scores.shape[:2], self.num_heads, -1).softmax(dim=-1).flatten(2)
         return weights @ context.values + self.out.bias
 
-    def prepare(
-        self, context: Float[Tensor, "batch keys context_dim"], rotation: Rotation | None = None
-    ) -> PreparedTokens:
+    def prepare(self, context: Float[Tensor, "batch keys context_dim"]) -> PreparedTokens:
         """What does not depend on the queries: the products, or keys and values where there are too many tokens."""
         # The scores (W_q x + b_q)·k and the mixture Σ_k a_k W_o v_k are the same numbers in another order. For fewer
         # than ``dim`` pairs of head and token, two narrow products replace two of ``dim`` by ``dim`` per frame.
         dim = self.query.in_features
-        key, value = pairs = self.keys_values(context, rotation)
-        if self.rotary is not None or self.dropout or self.num_heads * context.shape[1] >= dim:
+        key, value = pairs = self.keys_values(context)
+        if self.num_heads * context.shape[1] >= dim:
             return pairs
         key = key / math.sqrt(key.shape[-1])
         # The maps by head, (heads, head_dim, dim); the bias of W_q becomes the offset, W_o's is added last.
@@ -218,13 +199,7 @@ class TokenAttention(Attention):
 
 
 class GruConstants(NamedTuple):
-    """Constants of a clip's decoding, computed once for all steps.
-
-    Attributes:
-        lengths: valid frames of each clip, on the CPU.
-        scale: factor on the result, (batch, 1, dim).
-        shift: added to it, (batch, 1, dim).
-    """
+    """Constants of a clip's decoding, computed once for all steps."""
 
     lengths: Tensor
     scale: Tensor
@@ -236,8 +211,6 @@ class GruDecoder(Decoder):
     """Gated recurrent units over time, the form of FaceDiffuser, scaled and shifted by the mean style token.
 
     Args:
-        dim: channels; given by the model.
-        style_dim: channels of a style token; given by the model.
         num_layers: recurrent layers.
         bidirectional: also read the sequence backwards (needs an even ``dim``).
         dropout: dropout between recurrent layers.
@@ -271,15 +244,9 @@ class GruDecoder(Decoder):
     def forward(self, fused: Frames, style: Tokens, mask: FrameMask, prepared: GruConstants | None = None) -> Frames:
         """F_dec of each frame."""
         lengths, scale, shift = self.prepare(style, mask) if prepared is None else prepared
-        if exporting():
-            # Graphs know no packed sequences: they take clips of one length, see ``graph_takes_padding``.
-            return torch.addcmul(shift, self.norm(all_states(self.gru, fused) + fused), scale)
-        # Packed, so that the backward direction starts at a clip's own last frame and not in its padding.
-        packed = pack_padded_sequence(fused, lengths, batch_first=True, enforce_sorted=False)
-        hidden, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=fused.shape[1])
         # A residual around the recurrent layers, and the style last, as in FaceDiffuser, where the style scales the
         # states before the last map.
-        return torch.addcmul(shift, self.norm(hidden + fused), scale)
+        return torch.addcmul(shift, self.norm(all_states(self.gru, fused, lengths) + fused), scale)
 
     def prepare(self, style: Tokens, mask: FrameMask) -> GruConstants:
         """The lengths, for which the device must be waited for, and the modulation by the style."""

@@ -116,11 +116,7 @@ def network_input(audio: Waves, context: int) -> Float[Tensor, "batch steps inpu
 
 
 class DeepSpeech(nn.Module):
-    """Three dense layers, one recurrent layer in both directions, two dense layers.
-
-    Args:
-        sizes: of :data:`SIZES`.
-    """
+    """Three dense layers, one recurrent layer in both directions, two dense layers."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         super().__init__()

@@ -32,10 +32,10 @@ from facediff.models.inference import Inference, Style, named
 from facediff.models.scoring import ScoredCorpus, regions_of
 from facediff.spaces.space import metres_per_unit
 
-IdentityPolicy = Literal["style_only", "each_seen", "adapted"]
+IdentityPolicy = Literal["style_only", "each_seen"]
 """Which identity unseen speakers are tested and predicted with. ``style_only``: none, with their reference's style.
 ``each_seen``: each training identity in turn, with that identity's own style, and the mean of the scores, as the
-released test scripts do. ``adapted``: their own, which the model must have been adapted to."""
+released test scripts do."""
 
 
 def conditioned(
@@ -49,11 +49,6 @@ def conditioned(
     unknown = [clip for clip in range(len(batch)) if clip not in clips]
     if not unknown or policy == "style_only":
         return [("", batch)]
-    if policy == "adapted":
-        raise FaceDiffError(
-            f"unseen_identity=adapted: clip {batch.names[unknown[0]]} is of {batch.identity_names[unknown[0]]}, whom "
-            f"the model was not trained on; adapt it with `facediff adapt`, or choose another policy"
-        )
     views = [("", batch.select(clips))] if clips else []
     unseen = batch.select(unknown)
     for index, name in enumerate(identities):
@@ -63,22 +58,14 @@ def conditioned(
 
 def with_identity(batch: Batch, index: int, reference: Reference | Style) -> Batch:
     """The batch as if all clips were of one training identity, with that identity's style."""
-    if isinstance(reference, Style):
-        return replace(
-            batch,
-            identity=batch.identity.new_full((len(batch),), index),
-            style=reference.vector.to(batch.reference).expand(len(batch), -1),
-            reference_names=[reference.name] * len(batch),
-        )
-    motion = reference.motion.to(batch.reference)
-    return replace(
-        batch,
-        identity=batch.identity.new_full((len(batch),), index),
-        reference=pad([motion] * len(batch)),
-        reference_lengths=batch.reference_lengths.new_full((len(batch),), len(motion)),
-        reference_names=[reference.clip] * len(batch),
-        style=None,
+    batch = replace(
+        batch, identity=batch.identity.new_full((len(batch),), index), reference_names=[named(reference)] * len(batch)
     )
+    if isinstance(reference, Style):
+        return replace(batch, style=reference.vector.to(batch.reference).expand(len(batch), -1))
+    motion = reference.motion.to(batch.reference)
+    lengths = batch.reference_lengths.new_full((len(batch),), len(motion))
+    return replace(batch, reference=pad([motion] * len(batch)), reference_lengths=lengths, style=None)
 
 
 def with_usual_styles(batch: Batch, style_of: Callable[[str], Reference | Style]) -> list[Batch]:
@@ -161,6 +148,8 @@ class Evaluation:
     No part of the model's module tree: weight averaging copies that tree before the regions are known.
     """
 
+    corpus: ScoredCorpus
+
     def __init__(
         self,
         protocol_name: str,
@@ -181,7 +170,6 @@ class Evaluation:
         self.metrics: dict[str, dict[str, ProtocolMetrics]] = {}
         self.chosen: dict[str, dict[str, dict[str, Metric]]] = {}
         self._sequences: list[dict[str, Any]] = []
-        self._corpus: ScoredCorpus | None = None
         self._validation_seeds = range(1)
 
     def prepare(
@@ -191,7 +179,7 @@ class Evaluation:
         if data is None and self.requests:
             raise FaceDiffError("model.metrics needs a SpeechMotionDataModule; pass datamodule=…")
         assets, corpus = model.assets, ScoredCorpus(data, model.assets)
-        self._corpus = corpus
+        self.corpus = corpus
         self._check_space(assets)
         scale = self._scale(assets)
         self.requests |= self.protocol.further(scale)
@@ -221,12 +209,6 @@ class Evaluation:
             }
             for split in self.splits
         }
-
-    @property
-    def corpus(self) -> ScoredCorpus:
-        """The corpus of :meth:`prepare`."""
-        assert self._corpus is not None  # noqa: S101 - for the type checker
-        return self._corpus
 
     def _check_space(self, assets: Assets) -> None:
         """Refuse a protocol that needs vertices, or channels, of a corpus that has none."""
@@ -395,8 +377,8 @@ class Evaluation:
             clip_scores = {name: scores_of_clips[row] for name, scores_of_clips in values.items()}
             facts = {"split": split, "method": method, "clip": clip, "identity": identity, "frames": frames}
             attributes = {} if corpus.data is None else corpus.data.corpus.clips[clip].attributes
-            names = () if corpus.data is None else corpus.data.score_attributes
-            self._sequences.append({**facts, **{name: attributes.get(name) for name in names}, **clip_scores})
+            columns = () if corpus.data is None else corpus.data.score_attributes
+            self._sequences.append({**facts, **{name: attributes.get(name) for name in columns}, **clip_scores})
 
     def sequences(self) -> list[dict[str, Any]]:
         """One row per test clip and method with its own scores, of all processes; collective under several.

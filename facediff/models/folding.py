@@ -55,14 +55,7 @@ def step_of_rows(step: Step, rows: Tensor) -> Int[Tensor, " batch"]:
 
 
 class VertexSpace:
-    """Motion itself.
-
-    Args:
-        embed: the network's first map, from noisy motion to its width.
-        unembed: the network's last map, from features to clean motion.
-        coordinates: numbers in a frame of motion, 3V.
-        rest: added to every prediction, such as the template of absolute vertices; nothing if None.
-    """
+    """Motion itself."""
 
     def __init__(
         self,

@@ -35,13 +35,7 @@ class FusionFactory(Protocol):
 
 
 class FusionConstants(NamedTuple):
-    """Constants of a clip's fusion, computed once for all steps.
-
-    Attributes:
-        query: of the speech, (batch, heads, frames, head_dim).
-        mask: True on valid frames; None if nothing is padded.
-        rotation: rotary positions, if there are any.
-    """
+    """Constants of a clip's fusion, computed once for all steps."""
 
     query: Tensor
     mask: Tensor | None
@@ -57,7 +51,6 @@ class BidirectionalCrossAttention(Fusion):
     carry rotary positions; without them the attention could not tell one frame's speech from another's.
 
     Args:
-        dim: channels; given by the model.
         num_heads: attention heads.
         rotary: rotary positions in both attentions.
         dropout: dropout on each attention's result.
@@ -99,11 +92,7 @@ class BidirectionalCrossAttention(Fusion):
 
 @fusion.register("add")
 class AddFusion(Fusion):
-    """Plain sum of speech and motion features (ablation of the cross-attention).
-
-    Args:
-        dim: channels; given by the model.
-    """
+    """Plain sum of speech and motion features (ablation of the cross-attention)."""
 
     def __init__(self, *, dim: Width) -> None:
         super().__init__()

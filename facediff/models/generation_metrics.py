@@ -28,16 +28,13 @@ from facediff.data.dataset import MotionDataset
 from facediff.errors import FaceDiffError, counted
 from facediff.metrics import (
     MeanVertexError,
-    MotionLiveliness,
     RealTimeFactor,
-    SpreadErrorRatio,
     device_name,
     feed,
     parse,
 )
 from facediff.models.base import AnimationModel
-from facediff.models.evaluation import with_identity
-from facediff.models.inference import named
+from facediff.models.evaluation import with_usual_styles
 from facediff.models.scoring import ScoredCorpus
 from facediff.registry import name_of
 from facediff.spaces.space import METRES
@@ -50,9 +47,6 @@ REFERENCES = ("own", "another")
 
 LABELS = ("hidden", "known")
 """Whether the model is told who a trained speaker is."""
-
-CHANNEL_GROUPS = ("expression", "jaw", "head", "eyes")
-"""Groups of channels of which liveliness is measured."""
 
 NEAREST_SPEAKER = "nearest_speaker_accuracy:components=64"
 
@@ -117,9 +111,6 @@ TABLE: dict[str, tuple[str, ...]] = {
     **{f"mve_{label}_another": (f"MVE with another speaker's reference / own, identity {label}",) for label in LABELS},
     "mve_hidden_own": ("MVE with own reference, identity hidden",),
     "mve_known_own": ("MVE with own reference, identity known",),
-    **{f"param_liveliness_{name}": (f"liveliness of the channels of {name} (1)",) for name in CHANNEL_GROUPS},
-    "param_spread": ("spread / error, all channels (1)",),
-    "param_mve": ("MVE of channels, one sample",),
     "real_time_factor": ("real-time factor, one sample",),
 }
 """By the names of the metrics in files: their titles, in parentheses the score of the truth itself, or of a model that
@@ -193,7 +184,6 @@ class EvaluationCorpus(ScoredCorpus):
         self.offered = replace(context, has={**context.has, "samples": {}})
         lacking = [(name, need) for name, needs in NEEDED.items() for need in needs if need not in self.offered.has]
         self.reasons = {name: self.offered.reasons[need] for name, need in lacking}
-        self.channels = {name: region for name, region in context.channels.items() if name in CHANNEL_GROUPS}
 
     def metrics(self, group: str, device: torch.device, **options: Any) -> dict[str, Metric]:  # noqa: ANN401
         """The metrics of a group that the corpus has all for, with further options."""
@@ -240,13 +230,7 @@ class EvaluationCorpus(ScoredCorpus):
 
 
 class Measurement:
-    """All metrics of one model on one split.
-
-    Args:
-        model: a trained model in evaluation mode.
-        corpus: the clips that are measured.
-        sampling: how it is asked for motion.
-    """
+    """All metrics of one model on one split."""
 
     def __init__(self, model: AnimationModel, corpus: EvaluationCorpus, sampling: SamplingOptions) -> None:
         self.model, self.corpus, self.sampling = model, corpus, sampling
@@ -261,31 +245,23 @@ class Measurement:
         self.metrics["references"] = {
             f"{label}_{whose}": MeanVertexError().to(device) for label in LABELS for whose in REFERENCES
         }
-        if corpus.channels:  # of the channels themselves, of motion in parameters
-            of_each = {f"param_liveliness_{name}": MotionLiveliness(region) for name, region in corpus.channels.items()}
-            self.metrics["channels"] = {**of_each, "param_mve": MeanVertexError()}
-            self.metrics["channel_samples"] = {"param_spread": SpreadErrorRatio(n_samples=count)}
-            for group in ("channels", "channel_samples"):
-                self.metrics[group] = {name: metric.to(device) for name, metric in self.metrics[group].items()}
         self.speed = RealTimeFactor(device_name(device))
         self.mouths: list[list[MouthMotion]] = []  # of each clip: made and true
 
     def _update(self, group: str, inputs: Mapping[str, Any]) -> None:
-        for metric in self.metrics.get(group, {}).values():
+        for metric in self.metrics[group].values():
             feed(metric, inputs)
 
     @torch.inference_mode()
     def add(self, clip: Clip, sample: Sample) -> None:
         """Generate motion for a clip, and score it."""
         batch, corpus = self.model.with_person_styles(collate([sample]).to(self.model.device)), self.corpus
-        motion, truth = self._samples(batch)[None], batch.motion
-        for every, key in (("channel_samples", "channels"), ("samples", "each")):
-            if key == "each":  # of vertices, where a rig decodes them
-                motion, truth = (corpus.decoded(side, batch.identity_names) for side in (motion, truth))
-            inputs = corpus.inputs(truth, truth, batch, corpus.needs)
-            self._update(every, {**inputs, "samples": motion.expand(-1, self.compared, -1, -1, -1)})
-            for one_sample in motion.unbind(1):
-                self._update(key, {**inputs, "prediction": one_sample})
+        sides = (self._samples(batch)[None], batch.motion)  # of vertices, where a rig decodes them
+        motion, truth = (corpus.decoded(side, batch.identity_names) for side in sides)
+        inputs = corpus.inputs(truth, truth, batch, corpus.needs)
+        self._update("samples", {**inputs, "samples": motion.expand(-1, self.compared, -1, -1, -1)})
+        for one_sample in motion.unbind(1):
+            self._update("each", {**inputs, "prediction": one_sample})
         if mouths := corpus.mouths(clip, motion[0, 0], truth[0]):
             self.mouths.append(mouths)
         mean = corpus.decoded(corpus.mean_faces.of([clip.identity]).to(batch.motion)[:, None], [clip.identity])
@@ -310,7 +286,8 @@ class Measurement:
         """Score motion with other references, with the label of a trained speaker and without."""
         views, corpus = dict(self._views(clip, sample)), self.corpus
         batch = collate(list(views.values())).to(self.model.device)
-        default, names = self._with_default_style(clip, sample), batch.identity_names
+        usual = with_usual_styles(collate([sample]).to(self.model.device), self.model.default_style)
+        default, names = next(iter(usual), None), batch.identity_names
         truth = corpus.decoded(batch.motion, names)
         for seed in range(self.sampling.seed, self.sampling.seed + (self.sampling.references if self.drawn > 1 else 1)):
             if default is not None:
@@ -322,16 +299,6 @@ class Measurement:
                 if name == "hidden_own":
                     numbers = corpus.numbers(batch)[:1]
                     self._update("own_reference", {"prediction": generated[number], "identities": numbers})
-
-    def _with_default_style(self, clip: Clip, sample: Sample) -> Batch | None:
-        """A clip with the style that its identity has where none is named; None if it has none, or the clip itself."""
-        try:
-            style = self.model.default_style(clip.identity)
-        except FaceDiffError:
-            return None
-        if named(style) == clip.name:  # of a speaker of evaluated clips only
-            return None
-        return with_identity(collate([sample]).to(self.model.device), sample.identity, style)
 
     def _views(self, clip: Clip, sample: Sample) -> list[tuple[str, Sample]]:
         views = []

@@ -192,11 +192,7 @@ ModelType = TypeVar("ModelType")
 
 
 class ModelPart(nn.Module, Generic[ModelType]):
-    """A part of a model as a module by itself, to become a graph.
-
-    Args:
-        model: gives the parameters.
-    """
+    """A part of a model as a module by itself, to become a graph."""
 
     def __init__(self, model: ModelType) -> None:
         super().__init__()
@@ -204,13 +200,7 @@ class ModelPart(nn.Module, Generic[ModelType]):
 
 
 class SpeechGraph(ModelPart[CheckpointContent]):
-    """Speech to one feature per frame of motion.
-
-    Args:
-        model: gives the parameters.
-        encode: makes the features.
-        steps_of: from a number of frames to the audio encoder's steps.
-    """
+    """Speech to one feature per frame of motion."""
 
     def __init__(self, model: CheckpointContent, encode: SpeechEncoding, steps_of: Callable[[int], int]) -> None:
         super().__init__(model)

@@ -24,12 +24,6 @@ class InventedSpeakers(nn.Module):
     components by another, its style reference gets the very same gains, and the identity is hidden: how wide this
     speaker opens the jaw or raises the brows can be told from the reference only. Timing, and the shapes of movements,
     stay the speaker's.
-
-    Args:
-        n_vertices: points.
-        dims: numbers of a point.
-        share: of the clips.
-        deviation: standard deviation of the logarithm of the gain on all motion; the components' is half of it.
     """
 
     def __init__(self, n_vertices: int, dims: int, share: float, deviation: float = 0.1) -> None:

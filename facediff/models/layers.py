@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from facediff.errors import ArgumentError
 from facediff.utils.ranges import Range
@@ -139,9 +140,20 @@ def interpolate_ends(features: Float[Tensor, "batch steps dim"], frames: int) ->
     return F.interpolate(features.transpose(1, 2), size=frames, mode="linear", align_corners=True).transpose(1, 2)
 
 
-def all_states(network: nn.GRU | nn.LSTM, x: Float[Tensor, "batch frames dim"]) -> Float[Tensor, "batch frames states"]:
-    """The states of a recurrent network after each frame, of clips of one length; its input has the batch first."""
-    return recurrent_nodes(network, x) if exporting() else network(x)[0]
+def all_states(
+    network: nn.GRU | nn.LSTM, x: Float[Tensor, "batch frames dim"], lengths: Int[Tensor, " batch"] | None = None
+) -> Float[Tensor, "batch frames states"]:
+    """The states of a recurrent network after each frame; its input has the batch first.
+
+    ``lengths`` are the clips' on the processor; all frames if None, and in graphs, which take clips of one length.
+    """
+    if exporting():
+        return recurrent_nodes(network, x)
+    if lengths is None:
+        return network(x)[0]
+    # Packed, so that the backward direction starts at a clip's own last frame and not in its padding.
+    packed = pack_padded_sequence(x, lengths, batch_first=True, enforce_sorted=False)
+    return pad_packed_sequence(network(packed)[0], batch_first=True, total_length=x.shape[1])[0]
 
 
 def recurrent_nodes(

@@ -25,15 +25,7 @@ TERMS = ("reconstruction", "velocity", "acceleration", "face")
 def training_losses(
     prediction: Motion, truth: Motion, mask: Mask, region: Int[Tensor, " upper_face"], weights: Mapping[str, float]
 ) -> dict[str, Tensor]:
-    """The four terms by name, and ``loss``: L = L_recon + λ_vel L_vel + λ_acc L_acc + λ_face L_face (eq. 15).
-
-    Args:
-        prediction: predicted motion.
-        truth: true motion.
-        mask: valid frames.
-        region: indices of the upper-face vertices R.
-        weights: weight of ``reconstruction``, ``velocity``, ``acceleration`` and ``face`` in the sum.
-    """
+    """The four terms by name, and ``loss``: L = L_recon + λ_vel L_vel + λ_acc L_acc + λ_face L_face (eq. 15)."""
     terms = {
         "reconstruction": reconstruction_loss(prediction, truth, mask),
         "velocity": velocity_loss(prediction, truth, mask),
@@ -113,13 +105,6 @@ def preconditioned_losses(
     Squared and not Huber's, and without L_face: the mean of the motions that are possible is the minimum of the first
     alone, and a sampler needs this mean. Huber's minimum lies nearer to the median, L_face's at the liveliness of
     a whole motion, which a mean over many does not have.
-
-    Args:
-        prediction: predicted coordinates.
-        truth: true coordinates.
-        mask: valid frames.
-        importance: weights of squared errors, of each coordinate in each clip.
-        weights: weight of ``reconstruction``, ``velocity`` and ``acceleration`` in the sum.
     """
     # Differences over time are linear, so the error's differences are the errors of velocity and acceleration.
     gap, valid = prediction - truth, mask

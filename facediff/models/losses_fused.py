@@ -125,21 +125,7 @@ class _FusedLosses(torch.autograd.Function):
 
 
 class _Blocks:
-    """The losses of blocks of vertices, with the tables that they share.
-
-    Args:
-        features: the batch's features, for its size and device.
-        weight: the map, for its number of coordinates and its type.
-        truth: true motion.
-        mask: valid frames.
-        region: upper-face vertices.
-        factors: weights of the terms.
-        scale: factor on the truth.
-        differentiated: whether gradients are differentiated.
-
-    Attributes:
-        rows: the coordinates of each block.
-    """
+    """The losses of blocks of vertices, with the tables that they share."""
 
     def __init__(
         self,

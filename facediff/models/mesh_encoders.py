@@ -60,13 +60,7 @@ class MeshEncoderFactory(Protocol):
 
 @mesh_encoder.register("linear")
 class LinearMeshEncoder(MeshEncoder):
-    """One linear map of all coordinates of a frame: X = Linear(M_ref) of the dual-path paper, section 1.3.1.
-
-    Args:
-        dim: channels of a frame's feature; given by the model.
-        n_vertices: points of the motion; given by the model.
-        dims: numbers of a point; given by the model.
-    """
+    """One linear map of all coordinates of a frame: X = Linear(M_ref) of the dual-path paper, section 1.3.1."""
 
     def __init__(self, *, dim: Width, n_vertices: Vertices, dims: Dims) -> None:
         super().__init__()
@@ -86,9 +80,6 @@ class ComponentMeshEncoder(MeshEncoder):
     and hardly the lids and brows, by which people differ as well. Here all movements come alike.
 
     Args:
-        dim: channels of a frame's feature; given by the model.
-        n_vertices: points of the motion; given by the model.
-        dims: numbers of a point; given by the model.
         count: components.
     """
 
@@ -110,14 +101,6 @@ class SpiralDown(nn.Module):
 
     Gong et al. 2019, SpiralNet++, eq. 1: a vertex's new feature is a linear map of the features along its spiral, one
     after the other. The convolution is evaluated only at the vertices that the down-sampling takes.
-
-    Args:
-        n_fine: vertices before the down-sampling.
-        n_coarse: vertices after it.
-        length: vertices of a spiral.
-        in_channels: channels of a vertex.
-        out_channels: channels of a vertex after it.
-        mean: take the mean of several vertices, each being part of one such mean; else one vertex.
     """
 
     table: Tensor
@@ -162,9 +145,6 @@ class SpiralMeshEncoder(MeshEncoder):
     disentanglement).
 
     Args:
-        dim: channels of a frame's feature; given by the model.
-        n_vertices: points of the motion; given by the model.
-        dims: numbers of a point; given by the model.
         channels: channels of a vertex after each step.
         factor: vertices before a down-sampling to one after it.
         spiral_length: vertices of a spiral, its centre included.

@@ -6,38 +6,27 @@ A card states the known facts of a model and says where one is unknown.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from facediff.models.checkpoint_content import IMPORTED, CheckpointContent
-from facediff.registry import COMPONENTS, corpus
+from facediff.registry import corpus
 from facediff.utils.hub import CONFIG
 from facediff.utils.licences import KNOWN, Licence, commercial_use
 
 LONGEST_NAME = 96
 
 
-def card(model: CheckpointContent, name: str, *, half: bool) -> str:
-    """The text of a model card: metadata in YAML, then Markdown.
-
-    Args:
-        model: with the labels that it is published with.
-        name: the model's name.
-        half: whether its parameters are stored in 16 bits.
-    """
+def card(model: CheckpointContent, name: str) -> str:
+    """The text of a model card: metadata in YAML, then Markdown."""
     import yaml
 
-    assets, provenance, data, options = model.assets, model.provenance, model.data_options, dict(model.hparams)
+    assets, provenance = model.assets, model.provenance
     about = [
         ("vertices", f"{model.n_vertices}, in {text(assets.unit)}"),
         ("frames a second", f"{model.frame_rate:g}"),
         ("identities", ", ".join(text(name) for name in model.identities)),
-        (
-            "weights",
-            f"{sum(weight.numel() for weight in model.parameters()) / 1e6:.2f} million, stored in "
-            f"{'16' if half else '32'} bits",
-        ),
-        *((kind.replace("_", " "), f"`{name}`") for kind, name in components(model).items()),
+        ("weights", f"{sum(weight.numel() for weight in model.parameters()) / 1e6:.2f} million"),
     ]
     corpus_rows = [
         ("corpus", text(assets.corpus)),
@@ -52,11 +41,6 @@ def card(model: CheckpointContent, name: str, *, half: bool) -> str:
         ("epochs", provenance.get("epochs", "not known")),
         ("optimiser steps", provenance.get("steps", "not known")),
         ("seed", provenance.get("seed", "not known")),
-        ("learning rate", f"{options.get('learning_rate', 'not known')}, {options.get('lr_schedule', '')}"),
-        ("weight decay", str(options.get("weight_decay", "not known"))),
-        ("clips a batch", str(data.get("batch_size", "not known"))),
-        ("training window", "whole clips" if data.get("window") is None else f"{data['window']} frames"),
-        ("weights stored", "the averaged ones, where training averaged them"),
     ]
     labels = [
         (text(label.of), text(label.name), label.commercial, text(label.source) or "not stated")
@@ -175,16 +159,6 @@ def metadata(model: CheckpointContent) -> dict[str, Any]:
     fields["corpus"] = {"name": model.assets.corpus, "synthetic": model.assets.synthetic}
     fields["commercial_use"] = commercial_use(model.licences)
     return fields
-
-
-def components(model: CheckpointContent) -> dict[str, str]:
-    """The names of the model's components by kind."""
-    options = {kind: model.hparams.get(kind) for kind in COMPONENTS}
-    return {
-        kind: str(option["class_path"]).rpartition(".")[2]
-        for kind, option in options.items()
-        if isinstance(option, Mapping) and "class_path" in option
-    }
 
 
 # Helpers.

@@ -15,6 +15,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Protocol
 
 import torch
@@ -175,21 +176,18 @@ class MotionSpace(nn.Module, ABC):
         coordinates: numbers in a frame.
         preconditioning: the scales around the network; None if it predicts clean motion itself.
         prior_frames: length of the windows of which :meth:`fit` takes the covariance over time; 1 for none.
+        region_weights: factors of regions' motion before its principal components are taken.
     """
 
     coordinates: int
     preconditioning: Preconditioning | None
     prior_frames: int = 1
+    region_weights: Mapping[str, float] = MappingProxyType({})
 
     @property
     def inputs(self) -> int:
         """Noisy coordinates, and smoothed ones of some frames where the preconditioning knows motion over time."""
         return self.coordinates * (1 if self.prior_frames == 1 else 1 + len(SEEN_AROUND))
-
-    @property
-    def region_weights(self) -> Mapping[str, float]:
-        """What motion is multiplied by before its principal components are taken, by the region's name."""
-        return {}
 
     def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
         """Variances of principal components as the noise sees them, from the motion's variances."""
@@ -218,13 +216,7 @@ class MotionSpaceFactory(Protocol):
 
 @motion_space.register("vertices")
 class VertexMotion(MotionSpace):
-    """All coordinates of all vertices; the network predicts clean motion (the paper's setting).
-
-    Args:
-        n_vertices: points; given by the model.
-        dims: numbers of a point; given by the model.
-        steps: of the noise process; given by the model.
-    """
+    """All coordinates of all vertices; the network predicts clean motion (the paper's setting)."""
 
     def __init__(self, *, n_vertices: Vertices, dims: Dims, steps: Steps) -> None:
         super().__init__()
@@ -249,9 +241,6 @@ class ComponentMotion(MotionSpace):
     d₁. Losses weigh each component as its vertices do, at any size in the noise.
 
     Args:
-        n_vertices: points; given by the model.
-        dims: numbers of a point; given by the model.
-        steps: of the noise process; given by the model.
         count: components K; motion outside them is lost.
         whitening: 0 keeps the components' sizes, which is vertices up to truncation; at 1 all are of equal size, so
             that noise hides small movements (lids, brows) no earlier than large ones (the jaw).
@@ -284,9 +273,8 @@ class ComponentMotion(MotionSpace):
         super().__init__()
         self.coordinates = count
         self.whitening = whitening
-        self._region_weights = {"upper_face": upper_face_weight, "lips": lips_weight}
-        if eyelids_weight is not None:
-            self._region_weights["eyelids"] = eyelids_weight
+        weights = {"upper_face": upper_face_weight, "lips": lips_weight, "eyelids": eyelids_weight}
+        self.region_weights = {name: weight for name, weight in weights.items() if weight is not None}
         self.components = PrincipalComponents(n_vertices, dims, count)
         self.register_buffer("sizes", torch.ones(count))
         if prior_frames % 2 == 0:
@@ -297,11 +285,6 @@ class ComponentMotion(MotionSpace):
         self.preconditioning: Preconditioning = (
             Preconditioning(steps, count) if prior_frames == 1 else TemporalPreconditioning(steps, count, prior_frames)
         )
-
-    @property
-    def region_weights(self) -> Mapping[str, float]:
-        """Factors of upper face, lips and eyelids."""
-        return self._region_weights
 
     def noised_variances(self, variances: Float[Tensor, " components"]) -> Float[Tensor, " components"]:
         """Sizes squared, of as many components as there are."""
@@ -356,10 +339,6 @@ class Preconditioning(nn.Module):
     skip · y + out · F(into · y). Without any network, F = 0, it is the posterior mean of Gaussian motion; F has to say
     what speech and style tell beyond that, in units of the deviation left open. All four tables are (steps,
     coordinates).
-
-    Args:
-        steps: of the noise process.
-        coordinates: numbers in a frame.
 
     Attributes:
         into: 1 / √(ᾱλ + 1 − ᾱ), which gives the network's input unit variance.
@@ -454,11 +433,6 @@ class TemporalPreconditioning(Preconditioning):
     A frame lies in the middle of its window, and nearer to an end only where the clip or the window of a stream ends.
     Shorter motion is taken as if it went on at the mean: without any network, its last frames vary by a quarter
     to a half too little.
-
-    Args:
-        steps: of the noise process.
-        coordinates: numbers in a frame.
-        frames: W, odd.
 
     Attributes:
         vectors: V of every coordinate, (coordinates, W, W).

@@ -64,10 +64,6 @@ class FactorSchedule(LRScheduler):
     Unlike PyTorch's ``LambdaLR`` it takes parameter groups that are added during training, as Lightning's
     ``BaseFinetuning`` adds them: such a group has the learning rate that it was added with, and follows the schedule
     from there. A resume keeps the position and takes the factor from the options.
-
-    Args:
-        optimizer: the optimiser.
-        factor: the factor of a step, counted from 0.
     """
 
     def __init__(self, optimizer: Optimizer, factor: Callable[[int], float]) -> None:

@@ -69,7 +69,6 @@ def publish(
     model: CheckpointContent,
     folder: Path,
     *,
-    half: bool = False,
     licence: str | None = None,
     name: str | None = None,
 ) -> Path:
@@ -83,8 +82,8 @@ def publish(
     model.licences = published_licences(before, licence)
     try:
         with atomic_folder(folder) as partial:
-            write_model(model, partial, half=half)
-            (partial / CARD).write_text(card(model, name or folder.resolve().name, half=half), encoding="utf-8")
+            write_model(model, partial)
+            (partial / CARD).write_text(card(model, name or folder.resolve().name), encoding="utf-8")
     finally:
         model.licences = before
     return folder
@@ -95,45 +94,32 @@ def published_licences(inherited: Iterable[Licence], name: str | None) -> tuple[
 
     Args:
         inherited: the model's labels.
-        name: the licence that its author chose for the weights; the data's if None.
+        name: the licence that its author chose for the weights; if None the strictest of the data's, of several equally
+            strict the first.
     """
     labels = list(inherited)
-    data_labels = [label for label in labels if label.of != "weights"]
-    # Weights that derive from published weights inherit their terms, as the parent's do.
-    parents = [replace(label, of="parent's weights") for label in labels if label.of == "weights"] if name else []
-    return merged([weights_licence(labels, name)], parents, data_labels)
-
-
-def weights_licence(inherited: Iterable[Licence], name: str | None) -> Licence:
-    """The label of a model's weights, from the licence that its author chose; by default the strictest of its data's.
-
-    Where several of the data's are equally strict, the first is named.
-    """
-    labels = list(inherited)
-    if name is not None:
-        return Licence("weights", name, known_licence(name), "chosen when the model was published")
     strictest = commercial_use(labels)
     origin = next((label for label in labels if label.commercial == strictest), Licence("weights"))
-    return Licence("weights", origin.name, strictest, f"as {origin.of}" if labels else "")
+    own, parents = Licence("weights", origin.name, strictest, f"as {origin.of}" if labels else ""), []
+    if name is not None:
+        own = Licence("weights", name, known_licence(name), "chosen when the model was published")
+        # Weights that derive from published weights inherit their terms, as the parent's do.
+        parents = [replace(label, of="parent's weights") for label in labels if label.of == "weights"]
+    return merged([own], parents, [label for label in labels if label.of != "weights"])
 
 
-def write_model(model: CheckpointContent, folder: Path, *, half: bool = False) -> dict[str, Any]:
+def write_model(model: CheckpointContent, folder: Path) -> dict[str, Any]:
     """Write a model's files into a folder that exists; not atomic.
 
     Args:
         model: trained, or read from a checkpoint.
         folder: an empty folder.
-        half: store parameters in 16 bits; buffers, which are constants of formulas, stay as they are.
 
     Returns:
         what ``config.json`` holds.
     """
     content = content_of(model)
-    weights = content.pop("state_dict")
-    if half:
-        parameters = {name for name, _ in model.named_parameters(remove_duplicate=False)}
-        weights = {name: halved(value) if name in parameters else value for name, value in weights.items()}
-    weights, shared = stored_once(weights)  # rounded before: a buffer that equals a parameter stays as it is
+    weights, shared = stored_once(content.pop("state_dict"))
     tensors: dict[str, Tensor] = {}
     config = {
         "format": FORMAT,
@@ -143,7 +129,7 @@ def write_model(model: CheckpointContent, folder: Path, *, half: bool = False) -
         "shared": shared,
     }
     write_safetensors(folder / WEIGHTS, weights)
-    arrays = {name: coded(value) if is_motion(value) else as_array(value) for name, value in tensors.items()}
+    arrays = {name: coded(value) if is_motion(value) else value.contiguous().numpy() for name, value in tensors.items()}
     with (folder / ASSETS).open("wb") as stream:
         np.savez_compressed(stream, **cast(Any, arrays))
     (folder / CONFIG).write_text(json_text(folder / CONFIG, config) + "\n", encoding="utf-8")
@@ -199,12 +185,6 @@ def stored_once(weights: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[
         else:
             shared[name] = twin
     return unique, shared
-
-
-def halved(value: Tensor) -> Tensor:
-    """A weight in 16 bits; as it is, where a number is too large for them."""
-    small = value.half() if value.dtype in (torch.float32, torch.float64) else value
-    return small if bool(small.isfinite().all()) else value
 
 
 def read_model(folder: Path, *, weights: bool = True) -> dict[str, Any]:
@@ -266,13 +246,6 @@ def with_tensors(value: Any, arrays: Mapping[str, np.ndarray[Any, Any]]) -> Any:
 def is_motion(value: Tensor) -> bool:
     """Whether a tensor is stored as differences between frames."""
     return value.ndim == 3 and len(value) >= MOTION_FRAMES and value.dtype in (torch.float16, torch.float32)
-
-
-def as_array(value: Tensor) -> np.ndarray[Any, Any]:
-    """A tensor as an array; of a type that NumPy lacks, as whole numbers of as many bytes."""
-    if value.dtype in (torch.bfloat16,):
-        return value.contiguous().view(torch.int16).numpy()
-    return value.contiguous().numpy()
 
 
 def coded(value: Tensor) -> np.ndarray[Any, Any]:

@@ -40,13 +40,8 @@ def cosine_betas(steps: int) -> list[float]:
     return [min(1 - signal((n + 1) / steps) / signal(n / steps), 0.999) for n in range(steps)]
 
 
-def cosine_variances(steps: int) -> Float[Tensor, " steps"]:
-    """The same as a tensor."""
-    return torch.tensor(cosine_betas(steps), dtype=torch.float32)
-
-
 SCHEDULES: dict[str, Callable[[int], Tensor]] = {
-    "squaredcos_cap_v2": cosine_variances,
+    "squaredcos_cap_v2": lambda steps: torch.tensor(cosine_betas(steps), dtype=torch.float32),
     "linear": lambda steps: torch.linspace(0.0001, 0.02, steps, dtype=torch.float32),
     "scaled_linear": lambda steps: torch.linspace(0.0001**0.5, 0.02**0.5, steps, dtype=torch.float32) ** 2,
 }
@@ -310,7 +305,6 @@ class DdimSampler(Sampler):
     """Few-step implicit sampling; deterministic after its start at eta 0 (Song et al. 2021).
 
     Args:
-        process: the noise process; given by the model.
         steps: denoising steps.
         eta: noise added per step, as a share of ancestral sampling's.
         spacing: ``steps`` spreads them evenly over the process, ``log_snr`` over the logarithm of its signal-to-noise
@@ -356,7 +350,6 @@ class DdpmSampler(DdimSampler):
     clipped, since motion has no fixed range.
 
     Args:
-        process: the noise process; given by the model.
         steps: denoising steps; all of the process's if None.
         spacing: as for ``ddim``.
         last_noise: as for ``ddim``.
@@ -383,7 +376,6 @@ class DpmSolverSampler(Sampler):
     """DPM-Solver++ multistep solver in its midpoint form; good results in few steps (Lu et al. 2022).
 
     Args:
-        process: the noise process; given by the model.
         steps: denoising steps.
         order: order of the solver, 1 to 3.
         spacing: ``steps`` spreads them evenly over the process, ``log_snr`` over the logarithm of its signal-to-noise

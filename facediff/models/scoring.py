@@ -36,11 +36,6 @@ class ScoredCorpus:
     """What scoring needs of a corpus in addition to its clips.
 
     Vertices are scored, also for channels, which their rig decodes; without a rig, channels are.
-
-    Args:
-        data: the corpus; None where batches are scored by the protocol alone.
-        assets: its templates, regions and rig.
-        speakers: who are told apart, by number; all with a template if None.
     """
 
     def __init__(
@@ -122,7 +117,9 @@ class ScoredCorpus:
         if "identities" in needs:
             inputs["identities"] = self.numbers(batch)
         if "closures" in needs:
-            inputs["closures"] = [self._closures(clip) for clip in batch.names]
+            files = [phonemes_file(self.data.root, clip) for clip in batch.names]
+            rate = self.data.frame_rate
+            inputs["closures"] = [[] if file is None else closures(read_phonemes(file), rate) for file in files]
         if "partner" in needs:
             inputs["partner"] = pad(self._conversation("partner", batch))[..., None].to(motion.device)
         if "speaking" in needs:
@@ -132,11 +129,6 @@ class ScoredCorpus:
     def numbers(self, batch: Batch) -> list[int]:
         """The number of each clip's speaker."""
         return [self.speakers.index(name) for name in batch.identity_names]
-
-    def _closures(self, clip: str) -> list[tuple[int, int]]:
-        """The frames in which a clip's lips close for p, b and m; empty where its phonemes are not known."""
-        file = phonemes_file(self.data.root, clip)
-        return [] if file is None else closures(read_phonemes(file), self.data.frame_rate)
 
     def _conversation(self, folder: str, batch: Batch) -> list[Tensor]:
         """A conversation folder's recordings of each clip, for the frames that are read of the motion."""

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
-from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from facediff.models.layers import (
     Attention,
@@ -69,8 +68,6 @@ class HierarchicalIdentity(IdentityEncoder):
     F_id = LayerNorm([β_c e_c; β_m e_m; β_f e_f]) (eq. 11).
 
     Args:
-        dim: the model's channels; given by the model.
-        n_identities: number of training identities; given by the model.
         level_dim: channels of each level; ``dim`` if None.
     """
 
@@ -84,29 +81,18 @@ class HierarchicalIdentity(IdentityEncoder):
         self.norm = nn.LayerNorm(3 * width)
         self.token_dims = (width, width, width)
 
-    def level_weights(self) -> Float[Tensor, "identities 3"]:
-        """β_c, β_m, β_f of every identity (eq. 10); each row sums to one."""
-        return self.attention(torch.cat(self._tables(), dim=-1)).softmax(-1)
-
     def forward(self, identity: Int[Tensor, " batch"]) -> Float[Tensor, "batch identity_dim"]:
         """F_id of each clip; an unseen speaker, or a hidden identity, gets the mean over all identities."""
-        weights = self.level_weights().unbind(-1)
-        weighted = [weight[:, None] * table for weight, table in zip(weights, self._tables(), strict=True)]
+        tables = [self.coarse.weight, self.mid.weight, self.fine.weight]
+        weights = self.attention(torch.cat(tables, dim=-1)).softmax(-1).unbind(-1)  # eq. 10
+        weighted = [weight[:, None] * table for weight, table in zip(weights, tables, strict=True)]
         features = self.norm(torch.cat(weighted, dim=-1))  # eq. 11
         return torch.where((identity >= 0)[:, None], features[identity.clamp_min(0)], features.mean(0)[None])
-
-    def _tables(self) -> list[Tensor]:
-        return [self.coarse.weight, self.mid.weight, self.fine.weight]
 
 
 @identity_encoder.register("none")
 class NoIdentity(IdentityEncoder):
-    """No identity condition (ablation).
-
-    Args:
-        dim: the model's channels; given by the model.
-        n_identities: number of training identities; given by the model.
-    """
+    """No identity condition (ablation)."""
 
     def __init__(self, *, dim: Width, n_identities: Count) -> None:
         super().__init__()
@@ -190,20 +176,10 @@ class TcnGruTransformer(StyleEncoder):
 
     def forward(self, reference: Frames, mask: FrameMask) -> StyleVectors:
         """F_dyn of each clip (eq. 9)."""
-        style = self.mlp(self.pooling(self.features(reference, mask), mask))
-        return style if self.statistics is None else style + self.statistics(mean_and_deviation(reference, mask))
-
-    def features(self, reference: Tensor, mask: Tensor) -> Tensor:
-        """F_attn (batch, frames, dim)."""
         column = mask[..., None].to(reference.dtype)
         lengths = mask.sum(1)
         x = torch.stack([branch(reference, column) for branch in self.branches]).mean(0)  # F_TCN, eq. 2
-        # Packed, so that the backward direction starts at a clip's own last frame and not in its padding (eq. 3 to 5).
-        if exporting():
-            x = all_states(self.gru, x)  # graphs take clips of one length
-        else:
-            packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
-            x, _ = pad_packed_sequence(self.gru(packed)[0], batch_first=True, total_length=mask.shape[1])
+        x = all_states(self.gru, x, lengths if exporting() else lengths.cpu())  # eq. 3 to 5
         # The position embedding P, stretched to each clip's length, and the Transformer (eq. 6).
         # By relative place: a table of absolute positions would leave rows for long references untrained, and the
         # reference's length is chosen by the user.
@@ -212,7 +188,8 @@ class TcnGruTransformer(StyleEncoder):
         x = x + nn.functional.pad(positions, (0, 0, 0, mask.shape[1] - positions.shape[1]))
         for layer in self.layers:
             x = layer(x, mask)
-        return self.norm(x)
+        style = self.mlp(self.pooling(self.norm(x), mask))
+        return style if self.statistics is None else style + self.statistics(mean_and_deviation(reference, mask))
 
 
 def mean_and_deviation(
@@ -228,15 +205,7 @@ def mean_and_deviation(
 
 
 class TemporalBlock(nn.Module):
-    """Residual block of two dilated convolutions over time (Bai et al. 2018, figure 1b).
-
-    Args:
-        dim: channels.
-        dilation: distance in frames between the taps of a kernel.
-        kernel_size: taps.
-        causal: look into the past only, as Bai et al. do; else centre the kernel.
-        dropout: dropout after each convolution.
-    """
+    """Residual block of two dilated convolutions over time (Bai et al. 2018, figure 1b)."""
 
     def __init__(self, dim: int, dilation: int, kernel_size: int, *, causal: bool, dropout: float) -> None:
         super().__init__()
@@ -284,15 +253,11 @@ class AttentionPooling(nn.Module):
         self.hidden = nn.Linear(dim, dim)
         self.score = nn.Linear(dim, 1, bias=False)
 
-    def weights(self, features: Frames, mask: FrameMask) -> Float[Tensor, "batch frames"]:
-        """γ: sums to one over each clip's frames and is exactly zero on padding."""
+    def forward(self, features: Frames, mask: FrameMask) -> Float[Tensor, "batch dim"]:
+        """The weighted mean s; γ is exactly zero on padding."""
         # −∞ before the softmax gives padding a weight of exactly zero.
         score = self.score(torch.tanh(self.hidden(features))).squeeze(-1)
-        return score.masked_fill(~mask, -torch.inf).softmax(-1)
-
-    def forward(self, features: Frames, mask: FrameMask) -> Float[Tensor, "batch dim"]:
-        """The weighted mean s."""
-        return torch.einsum("bt,btc->bc", self.weights(features, mask), features)
+        return torch.einsum("bt,btc->bc", score.masked_fill(~mask, -torch.inf).softmax(-1), features)
 
 
 @style_encoder.register("lstm")
@@ -300,7 +265,6 @@ class LstmStyle(StyleEncoder):
     """Last state of an LSTM that reads the frames in order (Chai et al., style-content disentanglement).
 
     Args:
-        dim: channels of a frame; given by the model.
         style_dim: channels of the style.
         num_layers: recurrent layers.
         pooling: the ``last`` state, as in the published work, or the ``mean`` of the states over all frames, which
@@ -317,25 +281,17 @@ class LstmStyle(StyleEncoder):
 
     def forward(self, reference: Frames, mask: FrameMask) -> StyleVectors:
         """The state after each clip's last frame."""
-        states = self.states(reference, mask)
+        # Padding comes after all valid frames; zeros keep NaN and infinity there out of the gradient.
+        states = all_states(self.lstm, reference.masked_fill(~mask[..., None], 0.0))
         if self.pooling == "mean":
             return (states * mask[..., None]).sum(1) / mask.sum(1)[:, None].clamp_min(1)
         last = mask.sum(1) - 1
         return states[torch.arange(states.shape[0], device=states.device), last]
 
-    def states(self, reference: Frames, mask: FrameMask) -> Float[Tensor, "batch frames style_dim"]:
-        """The state after each frame: it depends on that frame and those before it alone."""
-        # Padding comes after all valid frames; zeros keep NaN and infinity there out of the gradient.
-        return all_states(self.lstm, reference.masked_fill(~mask[..., None], 0.0))
-
 
 @style_encoder.register("none")
 class NoStyle(StyleEncoder):
-    """No dynamic style condition (ablation).
-
-    Args:
-        dim: the model's channels; given by the model.
-    """
+    """No dynamic style condition (ablation)."""
 
     def __init__(self, *, dim: Width) -> None:
         super().__init__()

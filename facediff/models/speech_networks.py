@@ -7,7 +7,6 @@ part; the network is the same. Its convolutions are frozen in all of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import torch
@@ -29,7 +28,7 @@ from facediff.models.audio_encoders import (
     transformer,
     with_edges,
 )
-from facediff.models.layers import Share, Width, exporting, interpolate_ends, longest
+from facediff.models.layers import Share, Width, exporting, interpolate_ends
 from facediff.registry import audio_encoder
 from facediff.utils.ranges import Range
 
@@ -142,7 +141,7 @@ class Wav2Vec2Encoder(FrozenEncoder):
         def encode(x: Tensor, count: int) -> Tensor:
             return self.hidden_states(resampled(x, count)) if early else resampled(self.hidden_states(x), count)
 
-        hidden = by_lengths(features, lengths, steps, encode)
+        hidden, _ = by_length(features, lengths, encode, steps)
         return hidden if self.out is None else self.out(hidden)
 
     def hidden_of(
@@ -167,16 +166,3 @@ class Wav2Vec2Encoder(FrozenEncoder):
         hidden = self.network.feature_projection(features)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # wav2vec 2.0 gives its normalised input as well
         return transformer(self.network, spec_augmented(self.network, hidden))
-
-
-def by_lengths(padded: Tensor, lengths: Tensor, steps: Tensor, encode: Callable[[Tensor, int], Tensor]) -> Tensor:
-    """Encode clips that agree in length and wanted steps together, without their padding; the padded results."""
-    if exporting():
-        return encode(padded, longest(steps))  # graphs take clips of one length
-    # The networks attend to all of a clip without a mask, so padding would change every step.
-    parts: dict[int, Tensor] = {}
-    pairs = list(zip(lengths.tolist(), steps.tolist(), strict=True))
-    for length, count in sorted(set(pairs)):
-        rows = [row for row, pair in enumerate(pairs) if pair == (length, count)]
-        parts.update(zip(rows, encode(padded[rows, :length], count), strict=True))
-    return nn.utils.rnn.pad_sequence([parts[row] for row in range(len(padded))], batch_first=True)

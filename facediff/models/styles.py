@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from facediff.animation.styles import Stillness, StyleFile, StyleReader, open_style, stillness_of, with_layout
+from facediff.animation.styles import Stillness, StyleFile, StyleReader, open_style, stillness_of
 from facediff.data import Reference, SpeechMotionDataModule
 from facediff.data.corpus import read_manifest, read_templates
 from facediff.data.storage import MOTION_FOLDERS, motion_path, open_motion
@@ -20,7 +20,6 @@ from facediff.errors import OptionError, choices, refuse_idle
 from facediff.models.inference import Style, named
 from facediff.registry import corpus, find_class
 from facediff.spaces.files import ParameterClip
-from facediff.spaces.layouts import find_layout
 
 if TYPE_CHECKING:
     from facediff.animation import Animation
@@ -119,24 +118,6 @@ class ModelStyles(StyleReader[Reference | Style]):
         if name in self.model.styled_identities():  # as the styles of an exported folder are named
             return self.model.default_style(name)
         return next((reference for reference in self.model.assets.references.values() if reference.clip == name), None)
-
-    def recorded(self, name: str) -> ParameterClip | None:
-        """Motion in parameters, ARTalk's style clips (``.pt``) among it."""
-        path, stated = with_layout(name)
-        if path.suffix != ".pt" or not path.is_file():
-            return super().recorded(name)
-        from facediff.utils.torch_files import load_tensors
-
-        entry = find_layout(stated or "flame_artalk", f"--style {path}")
-        content = load_tensors(path)
-        is_clip = isinstance(content, torch.Tensor) and content.is_floating_point()
-        values: npt.NDArray[np.floating] = content.float().numpy() if is_clip else np.zeros(0, np.float32)
-        if values.ndim != 2 or values.shape[1] != len(entry.space.channels) or not np.isfinite(values).all():
-            raise OptionError.naming(
-                f"{{style}} {path}: holds no tensor of finite numbers (frames, {len(entry.space.channels)}); expected "
-                f"a style clip such as ARTalk's, or state its layout: {path.name}@LAYOUT"
-            )
-        return ParameterClip(path.stem, values, entry.space, entry.frame_rate or 25.0)
 
     def clip(self, name: str) -> StyleFile:
         """The motion of a clip of the training corpus, if the corpus is on this machine."""

@@ -457,7 +457,6 @@ class Animator:
         self,
         folder: str | Path,
         *,
-        half: bool = False,
         license: str | None = None,  # noqa: A002 - the hub's word
         name: str | None = None,
     ) -> Path:
@@ -465,14 +464,13 @@ class Animator:
 
         Args:
             folder: a folder that does not exist, or is empty.
-            half: store the parameters in 16 bits; the motion differs a little.
             license: licence of the weights, such as ``apache-2.0``; as the data if None.
             name: the model's name in the card; the folder's if None.
 
         Raises:
             FaceDiffError: if the folder is not empty or cannot be written.
         """
-        return self.module.save_pretrained(folder, half=half, license=license, name=name)
+        return self.module.save_pretrained(folder, license=license, name=name)
 
     def __repr__(self) -> str:
         identities = f"identities {', '.join(self.identities)}"

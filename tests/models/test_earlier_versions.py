@@ -52,9 +52,10 @@ def test_a_checkpoint_of_1_1_loads_and_one_with_what_is_gone_is_refused(
     trainer.fit(make_model(), datamodule=tiny)
     trainer.save_checkpoint(path)
     content = torch.load(path, weights_only=True)
-    torch.save(with_option(content, min_snr=None, invented_gain=0.1), path)
+    of_tests = {"score_by": ["mood"], "unseen_identity": "adapted"}
+    torch.save(with_option(content, min_snr=None, invented_gain=0.1, style_guidance=1.0, **of_tests), path)
     for model in (load_model(path), DualPathDiffusion.load_from_checkpoint(path)):
-        assert not {"min_snr", "invented_gain"} & model.hparams.keys()
+        assert not {"min_snr", "invented_gain", "style_guidance", "score_by"} & model.hparams.keys()
         assert all(torch.equal(model.state_dict()[name], value) for name, value in content["state_dict"].items())
     torch.save(with_option(content, min_snr=5.0), path)
     with pytest.raises(FaceDiffError, match=r"earlier\.ckpt: min_snr=5\.0 .*facediff 1\.1"):
@@ -73,7 +74,9 @@ def test_values_of_removed_options_may_follow_from_others_and_sizes_may_be_any()
 
 @pytest.mark.parametrize("prefix", ["", "facediff.models.", "facediff.models.dual_path.model."])
 def test_configs_of_1_1_are_read_however_they_name_the_class(prefix: str) -> None:
-    config = {"model": {"class_path": f"{prefix}DualPathDiffusion", "init_args": {"dim": 8, "min_snr": None}}}
+    config = {
+        "model": {"class_path": f"{prefix}DualPathDiffusion", "init_args": {"dim": 8, "min_snr": None, "score_by": []}}
+    }
     assert without_removed_options([config], "run/config.yaml")[0]["model"]["init_args"] == {"dim": 8}
     other = {"class_path": "mine.DualPathDiffusion", "init_args": {"min_snr": 5.0}}
     assert without_removed_options(other, "run/config.yaml") == other

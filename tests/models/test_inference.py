@@ -14,10 +14,10 @@ from torch import Tensor
 from facediff.data import Batch, Sample, collate
 from facediff.models.audio_encoders import AudioEncoder
 from facediff.models.inference import ClipNoise, Inference, SpeechStream, WindowNoise
-from facediff.speech.windows import MotionWindow, WindowPlan
+from facediff.speech.windows import FramePlan, MotionWindow, WindowPlan
 
 PLAN = WindowPlan(seconds=1.2, overlap=0.4, before=0.5, after=0.2, above=2.0)  # 30, 10, 12 and 5 frames
-HOP, FRAMES, SHARED, BEFORE, AFTER = 20, 30, 10, 12, 5
+FRAMES, SHARED = 30, 10
 CPU = torch.device("cpu")
 Array = np.ndarray
 
@@ -56,30 +56,32 @@ def clip() -> Batch:
     return collate([sample])
 
 
-def expected(speech: Array, total: int) -> Array:
-    """The same by hand: what each window hears, how loud it takes it to be, and the blend of two windows."""
-    speech = np.pad(speech, (0, max(0, total * 640 - len(speech))))
-    out, before, index = np.zeros(0), None, 0
+def expected(speech: Array, total: int, plan: FramePlan) -> Array:
+    """The motion of :class:`Echo` by hand: what each window hears, and the blend of the frames that may change."""
+    out: list[float] = []
+    held: Array | None = None
     while True:
-        start = index * HOP
-        left = total - start
-        if before is not None and left <= SHARED:
-            return np.concatenate([out, before[:left]])
-        last = left <= FRAMES
-        frames = left if last else FRAMES
-        heard = min(total, start + FRAMES + AFTER)
-        context = min(BEFORE, start)
-        known = speech[: heard * 640]
+        new = len(out)  # given out so far, where the window's own frames begin
+        left = total - new
+        if held is not None and left <= plan.overlap:
+            return np.concatenate([out, held[:left]])
+        count = min(left, plan.frames)
+        start = max(0, new - plan.past)
+        context = min(plan.before, start)
+        known = (
+            speech[: min(total, new + plan.frames + plan.after) * 640] if left > plan.frames else speech[: total * 640]
+        )
         scaled = (known - known.mean()) / max(known.std(), 0.003)
         values = scaled[(start - context) * 640 :].reshape(-1, 640).mean(1)
-        values = (values + 0.1 * np.arange(len(values)) + 0.003 * len(values))[context : context + frames]
-        if before is not None:
-            share = np.arange(SHARED) / SHARED
+        values = (values + 0.1 * np.arange(len(values)) + 0.003 * len(values))[context + new - start :][:count]
+        if held is not None:
+            share = np.arange(plan.overlap) / max(1, plan.overlap)
             share = 3 * share**2 - 2 * share**3
-            values[:SHARED] = (1 - share) * before + share * values[:SHARED]
-        if last:
+            values[: plan.overlap] = (1 - share) * held + share * values[: plan.overlap]
+        if left <= plan.frames:
             return np.concatenate([out, values])
-        out, before, index = np.concatenate([out, values[:HOP]]), values[-SHARED:], index + 1
+        out += values[: plan.hop].tolist()
+        held = values[plan.hop :]
 
 
 @pytest.mark.parametrize("frames", [3, 29, 30, 31, 35, 49, 50, 51, 60, 61, 83, 120])
@@ -95,7 +97,7 @@ def test_long_speech_is_the_loop_over_windows(frames: int, loudness: float) -> N
     made = torch.cat([*parts, stream.finish()], 1)
     assert made.shape == (2, frames, 2, 3)
     assert stream.frames == frames
-    wanted = np.broadcast_to(expected(speech, frames)[None, :, None, None], made.shape)
+    wanted = np.broadcast_to(expected(speech, frames, PLAN.in_frames(25.0))[None, :, None, None], made.shape)
     np.testing.assert_allclose(made.numpy(), wanted, rtol=1e-3, atol=2e-3)
 
 

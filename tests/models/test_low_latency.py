@@ -13,9 +13,9 @@ from facediff import registry
 from facediff.models.dual_path.model import DualPathDiffusion
 from facediff.models.inference import SpeechStream, WindowNoise
 from facediff.speech.voice_activity import QUICK_GATE, Openness, read_gate
-from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS, FramePlan, WindowPlan
+from facediff.speech.windows import LOW_LATENCY, LOW_LATENCY_AHEAD, LOW_LATENCY_STEPS, WindowPlan
 from tests.fakes.tiny import Tiny
-from tests.models.test_inference import CPU, Array, Echo, clip
+from tests.models.test_inference import CPU, Echo, clip, expected
 
 PLANS = [
     WindowPlan(0.04, 0.0, before=0.2, after=0.12, above=0, past=0.4),  # a frame each, after ten frames of the past
@@ -23,34 +23,6 @@ PLANS = [
     WindowPlan(0.2, 0.16, before=0.0, after=0.0, above=0, past=0.12),  # shares more than it hops
     WindowPlan(0.12, 0.0, before=0.6, after=0.08, above=0, past=0.04),
 ]
-
-
-def expected(speech: Array, total: int, plan: FramePlan) -> Array:
-    """The motion of :class:`Echo` by hand: what each window hears, and the blend of the frames that may change."""
-    out: list[float] = []
-    held: Array | None = None
-    while True:
-        new = len(out)  # given out so far, where the window's own frames begin
-        left = total - new
-        if held is not None and left <= plan.overlap:
-            return np.concatenate([out, held[:left]])
-        count = min(left, plan.frames)
-        start = max(0, new - plan.past)
-        context = min(plan.before, start)
-        known = (
-            speech[: min(total, new + plan.frames + plan.after) * 640] if left > plan.frames else speech[: total * 640]
-        )
-        scaled = (known - known.mean()) / max(known.std(), 0.003)
-        values = scaled[(start - context) * 640 :].reshape(-1, 640).mean(1)
-        values = (values + 0.1 * np.arange(len(values)) + 0.003 * len(values))[context + new - start :][:count]
-        if held is not None:
-            share = np.arange(plan.overlap) / max(1, plan.overlap)
-            share = 3 * share**2 - 2 * share**3
-            values[: plan.overlap] = (1 - share) * held + share * values[: plan.overlap]
-        if left <= plan.frames:
-            return np.concatenate([out, values])
-        out += values[: plan.hop].tolist()
-        held = values[plan.hop :]
 
 
 @pytest.mark.parametrize("plan", PLANS)

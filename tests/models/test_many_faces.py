@@ -165,7 +165,7 @@ def test_faces_take_each_others_styles(roots: dict[str, Path], trained: Path, tm
 def test_folders_of_publish_keep_all_faces(trained: Path, tmp_path: Path) -> None:
     whole = load_model(trained)
     assert isinstance(whole, ManyFaces)
-    for part in (whole, whole.face("halved")):
+    for part in (whole, dict(whole.heads())["halved"]):
         part.data_options["root"] = part.data_source["root"] = "corpora/mine"
     whole.save_pretrained(tmp_path / "folder")
     speech = torch.sin(torch.arange(8000) / 9) * 0.3
@@ -176,18 +176,3 @@ def test_folders_of_publish_keep_all_faces(trained: Path, tmp_path: Path) -> Non
     config = (tmp_path / "folder" / "config.json").read_text()
     assert str(tmp_path.parent) not in config
     assert "corpora/mine" not in config
-
-
-def test_a_new_face_costs_a_head(roots: dict[str, Path], trained: Path, tmp_path: Path) -> None:
-    words = f"--checkpoint {trained} --face {__name__}.Halved --data-root {roots['halved']} -o {tmp_path}/new.ckpt"
-    assert main(["adapt", *words.split(), "--accelerator", "cpu", "--epochs", "2", "--yes", "--quiet"]) == 0
-    before, after = load_model(trained), load_model(tmp_path / "new.ckpt")
-    assert isinstance(before, ManyFaces)
-    assert isinstance(after, DualPathDiffusion)
-    assert not isinstance(after, ManyFaces)
-    assert after.n_vertices == VERTICES // 2
-    for one, other in zip(before.network.trunk(), after.network.trunk(), strict=True):
-        assert torch.equal(one, other)
-    assert bool(after.network.unembed.weight.any())  # it starts from zero
-    assert float(after.motion_space.sizes[0]) == pytest.approx(float(before.motion_space.sizes[0]), rel=1e-4)
-    assert after.animate(torch.zeros(8000), identity="A").vertices.shape[1:] == (VERTICES // 2, 3)

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from facediff import registry
 from facediff.data import Batch, collate
-from facediff.data.corpus import Clip, Corpus
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
 from facediff.models.adaptation import with_extra_identities
@@ -375,54 +374,6 @@ def trained(make_model: Make, make_trainer: Callable[..., Trainer], tiny: Tiny) 
     model: DualPathDiffusion = make_model(motion_space=SPACE, noise_scale="auto", learning_rate=1e-2)
     make_trainer(max_epochs=2).fit(model, datamodule=tiny)
     return model.eval()
-
-
-@pytest.mark.parametrize("frames", [4, 16])
-def test_principal_motion_is_that_of_the_spread_frames(
-    frames: int, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("facediff.data.measuring.FRAMES", frames)
-    tiny.setup("fit")
-    stack = []
-    for number, clip in enumerate(tiny.clips("train"), start=1):
-        motion = tiny.corpus.read_motion(clip).double().flatten(1)
-        count, phase = min(frames, len(motion)), number * (np.sqrt(5) - 1) / 2 % 1
-        stack.append(motion[((np.arange(count) + phase) / count * len(motion)).astype(int)])
-    matrix = torch.cat(stack).numpy()
-    assert (len(matrix) > matrix.shape[1]) == (frames == 16)  # either way of computing them
-    weights = torch.linspace(0.5, 2, matrix.shape[1])
-    mean, shapes = tiny.principal_motion(5, weights)
-    np.testing.assert_allclose(mean, matrix.mean(0), rtol=1e-5, atol=1e-9)
-    _, sizes, directions = np.linalg.svd((matrix - matrix.mean(0)) * weights.numpy(), full_matrices=False)
-    kept = min(5, int((sizes**2 > 1e-10 * sizes[0] ** 2).sum()))
-    assert len(shapes) == kept
-    expected = directions[:kept] * sizes[:kept, None] / len(matrix) ** 0.5
-    signs = np.sign((expected * shapes.numpy()).sum(1, keepdims=True))
-    np.testing.assert_allclose(shapes.numpy(), signs * expected, rtol=1e-3, atol=1e-4 * float(np.abs(expected).max()))
-
-
-def test_two_frames_of_each_clip_tell_how_far_speech_moves(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of large meshes no more are read, and the first and last frames of clips are silent."""
-    monkeypatch.setattr("facediff.data.measuring.PRINCIPAL_NUMBERS", 1)
-    read = Corpus.read_motion
-
-    def with_silent_ends(self: Corpus, clip: Clip, start: int = 0, stop: int | None = None) -> Tensor:
-        motion = read(self, clip)
-        motion[[0, -1]] = 0
-        return motion[start:stop]
-
-    def spread(self: Corpus, clip: Clip, count: int, phase: float | None = None) -> Tensor:
-        motion = with_silent_ends(self, clip)
-        places = np.linspace(0, len(motion) - 1, count) if phase is None else (np.arange(count) + phase) * len(motion)
-        return motion[(places / (1 if phase is None else count)).astype(int)]
-
-    monkeypatch.setattr(Corpus, "read_motion", with_silent_ends)
-    monkeypatch.setattr(Corpus, "read_spread", spread)
-    tiny.setup("fit")
-    everything = torch.cat([tiny.corpus.read_motion(clip).flatten(1) for clip in tiny.clips("train")]).double()
-    _, shapes = tiny.principal_motion(1)
-    direction = shapes[0].double() / shapes[0].norm()
-    assert float((everything @ direction).std()) == pytest.approx(float(shapes[0].norm()), rel=0.5)
 
 
 def test_training_measures_components_and_noise_scale(trained: DualPathDiffusion, tiny: Tiny) -> None:

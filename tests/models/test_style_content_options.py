@@ -6,6 +6,7 @@ import pickle
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,20 +28,15 @@ from tests.fakes.tiny import Tiny, write_tiny
 MakeTrainer = Callable[..., Trainer]
 
 
-def test_the_rate_falls_by_a_tenth_in_every_epoch_from_the_thirtieth() -> None:
-    options = {"total": 200 * 7, "warmup_steps": 0, "schedule": "exponential", "epoch_steps": 7}
-    for epoch, expected in ((0, 1.0), (29, 1.0), (30, 0.9), (31, 0.81), (199, 0.9**170)):
-        for step in (0, 6):
-            assert lr_factor(7 * epoch + step, **options) == pytest.approx(expected), epoch  # type: ignore[arg-type]
-    assert lr_factor(0, **{**options, "warmup_steps": 10}) == pytest.approx(0.1)  # type: ignore[arg-type]
-
-
-def test_the_rate_may_fall_once_in_some_epochs() -> None:
-    options = {"total": 200 * 7, "warmup_steps": 0, "schedule": "step", "epoch_steps": 7, "decay": 0.5}
-    for epoch, expected in ((0, 1.0), (19, 1.0), (20, 0.5), (39, 0.5), (40, 0.25), (199, 0.5**9)):
-        for step in (0, 6):
-            found = lr_factor(7 * epoch + step, decay_epoch=20, **options)  # type: ignore[arg-type]
-            assert found == pytest.approx(expected), epoch
+def test_the_rate_falls_as_its_schedule_says() -> None:
+    """By a tenth in every epoch from the thirtieth, or by half once in twenty epochs."""
+    exponential = ((0, 1.0), (29, 1.0), (30, 0.9), (31, 0.81), (199, 0.9**170))
+    step = ((0, 1.0), (19, 1.0), (20, 0.5), (39, 0.5), (40, 0.25), (199, 0.5**9))
+    for name, factors, more in (("exponential", exponential, {}), ("step", step, {"decay": 0.5, "decay_epoch": 20})):
+        options: dict[str, Any] = {"total": 200 * 7, "warmup_steps": 0, "schedule": name, "epoch_steps": 7, **more}
+        for epoch, expected in factors:
+            assert [lr_factor(7 * epoch + n, **options) for n in (0, 6)] == pytest.approx([expected] * 2), (name, epoch)
+        assert lr_factor(0, **{**options, "warmup_steps": 10}) == pytest.approx(0.1)
 
 
 def test_training_follows_the_rate(tiny_root: Path, make_trainer: MakeTrainer) -> None:
@@ -132,7 +128,7 @@ def test_the_encoders_do_not_see_what_is_not_the_face(tmp_path: Path) -> None:
     other[:, :, 20:] += 1.0
     with torch.no_grad():
         assert torch.equal(model.encode_style(motion, mask), model.encode_style(other, mask))
-        assert torch.equal(model.encode_content(motion, mask), model.encode_content(other, mask))
+        assert torch.equal(model.network.content(motion, mask), model.network.content(other, mask))
     assert model.lower_face().tolist() == list(range(12))
     batch = next(iter(data.val_dataloader()))
     same = model.distance_to(batch, other, motion, mask, None)

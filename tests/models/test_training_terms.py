@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -74,24 +73,6 @@ def test_losses_draw_a_step_for_each_clip_and_unit_noise(
     assert float(noise.double().var()) == pytest.approx(1, abs=4 * (2 / noise.numel()) ** 0.5)
     assert not torch.equal(noise[0], noise[1])
     assert not torch.equal(noise[0, 0], noise[0, 1])
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_identities_are_hidden_by_their_share_in_training_only(
-    make_model: Make, tiny: Tiny, batch: Batch, monkeypatch: pytest.MonkeyPatch, share: float
-) -> None:
-    model = known(make_model(identity_dropout=share), tiny)
-    seen: list[Tensor] = []
-    monkeypatch.setattr(model.network, "conditions", lambda _, identity, style, animated: seen.append(identity))
-    many = replace(batch, identity=torch.arange(4000) % 2)
-    torch.manual_seed(0)
-    model.conditions(many)
-    model.train().conditions(many)
-    assert torch.equal(seen[0], many.identity)
-    hidden = seen[1] == -1
-    assert torch.equal(seen[1][~hidden], many.identity[~hidden])
-    assert float(hidden.double().mean()) == pytest.approx(share, abs=4 * (share * (1 - share) / 4000) ** 0.5)
-    assert torch.equal(many.identity, torch.arange(4000) % 2)
 
 
 def test_the_style_path_sees_scaled_motion(model: DualPathDiffusion, batch: Batch) -> None:

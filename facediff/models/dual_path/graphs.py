@@ -123,7 +123,8 @@ def graphs_of(model: Generation) -> Graphs:
     root = None
     with torch.no_grad():
         if folded:  # else noise is used as it is, and the unit matrix of all coordinates would take gigabytes
-            root = model.denoiser(_nothing(step.inputs), unchanged).noise(torch.eye(state)[None])[0]
+            nothing = Conditions(step.inputs["features"], step.inputs["features"][:, :1], mask)
+            root = model.denoiser(nothing, unchanged).noise(torch.eye(state)[None])[0]
     decoded: Literal["sample", "kept"] = "kept" if folded else "sample"
     last = Graph(
         "motion",
@@ -153,8 +154,3 @@ def graphs_of(model: Generation) -> Graphs:
             quick_table=update_table(quick),
         ),
     )
-
-
-def _nothing(inputs: dict[str, Tensor]) -> Conditions:
-    """Conditions of example values."""
-    return Conditions(inputs["features"], inputs["features"][:, :1], inputs["mask"])

@@ -7,7 +7,7 @@ face is therefore a :class:`DualPathDiffusion` with the trunk of the first one.
 
 from __future__ import annotations
 
-import math
+import statistics
 from collections.abc import Iterator
 from typing import Any, Self, cast
 
@@ -70,11 +70,7 @@ class ManyFaces(DualPathDiffusion):
 
     def model_of(self, batch: Batch) -> DualPathDiffusion:
         """The model of the face that a batch is of; itself for the first."""
-        return self.face(batch.face)
-
-    def face(self, name: str) -> DualPathDiffusion:
-        """The model of a face by its name, which is empty for the first."""
-        return cast(DualPathDiffusion, self.further_faces[name]) if name else self
+        return dict(self.heads()).get(batch.face, self)
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
         """Let every face take its own corpus."""
@@ -113,7 +109,7 @@ class ManyFaces(DualPathDiffusion):
         """Log the metrics of each further face as ``val/NAME/mve`` …, and the mean over all faces as ``val/mve`` …."""
         scores = []
         for name in sorted(self._validated):  # a rehearsal of two batches sees two faces at most
-            scores.append(self.face(name).evaluation.scalars("val"))
+            scores.append(dict(self.heads()).get(name, self).evaluation.scalars("val"))
             metrics = {f"val/{name}/{key.removeprefix('val/')}": value for key, value in scores[-1].items() if name}
             self.log_dict(metrics, sync_dist=True)
         self._validated.clear()
@@ -141,6 +137,4 @@ class ManyFaces(DualPathDiffusion):
 
 def mean_over_faces(scores: list[float]) -> float:
     """The geometric mean of errors, which may have units of their own; the mean where a score is not above zero."""
-    if min(scores) > 0:
-        return math.exp(sum(map(math.log, scores)) / len(scores))
-    return sum(scores) / len(scores)
+    return statistics.geometric_mean(scores) if min(scores) > 0 else statistics.fmean(scores)

@@ -9,7 +9,7 @@ circles are the lines of these algorithms. Where the rest of the paper is:
 - eq. 10 and 11, identity: ``HierarchicalIdentity`` in the same file
 - eq. 12, cross-attention: ``BidirectionalCrossAttention`` in ``models/fusions.py``
 - eq. 13 and figure 3: ``DualPathNetwork.core`` in ``network.py``, ``StyleTransformer`` in ``models/decoders.py``
-- eq. 14: ``StyleTokens`` in ``conditioning.py``; identities are hidden by ``ConditionedModel.hide`` there
+- eq. 14: ``StyleTokens`` in ``conditioning.py``; identities are hidden by ``DualPathRecipe.hide`` in ``recipe.py``
 - eq. 15 to 19, losses: ``objective.py``, and as the paper prints them ``models/losses.py``
 
 Ours, and not the paper's: ``recipe.py`` (few sampling steps: ``last_noise_for``), ``speech_style.py`` and expressivity

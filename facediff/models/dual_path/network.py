@@ -1,4 +1,4 @@
-"""The denoising network (figure 3, eq. 12 and 13); its conditions stand in ``conditioning.py``.
+"""The conditions of a clip (eq. 14) and the denoising network (figure 3, eq. 12 and 13).
 
 The components that are chosen by name (encoders, fusion, decoder) have files of their own.
 """
@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from facediff.data import Batch
 from facediff.errors import FaceDiffError
 from facediff.models.dual_path.conditioning import (
-    ConditionEncoding,
     Conditions,
     StyleTokens,
     TemplateToken,
@@ -35,7 +35,7 @@ from facediff.models.folding import (
     step_of_rows,
     unchanged,
 )
-from facediff.models.layers import Frames
+from facediff.models.layers import Frames, exporting, frame_mask
 from facediff.models.motion_space import MotionSpace, Preconditioning
 
 TRUNK = (
@@ -45,19 +45,12 @@ TRUNK = (
 """Parts of a network that depend neither on the face nor on its speakers."""
 
 
-class DualPathNetwork(ConditionEncoding):
+class DualPathNetwork(nn.Module):
     """Predicts clean motion from noisy motion under speech, identity and style.
 
     In the denoising loop motion appears in linear maps only: ``embed`` (3V → C) and ``unembed`` (C → 3V), or fewer
     coordinates than 3V in another motion space. Outside it
     ``mesh_encoder`` stands in front of the style encoder (X = Linear(M_ref) in the paper).
-
-    Args:
-        options: the model's; its components are made here.
-        space: of the motion.
-        n_vertices: points of the motion.
-        dims: numbers of a point.
-        identities: how many.
     """
 
     def __init__(
@@ -101,11 +94,68 @@ class DualPathNetwork(ConditionEncoding):
         for name in TRUNK:
             setattr(self, name, getattr(source, name))
 
-    def trunk(self) -> list[nn.Parameter]:
-        """The weights of :data:`TRUNK`."""
-        parts = [getattr(self, name) for name in TRUNK]
-        vectors = [part for part in parts if isinstance(part, nn.Parameter)]
-        return vectors + [weight for part in parts if isinstance(part, nn.Module) for weight in part.parameters()]
+    @property
+    def style_dim(self) -> int:
+        """Numbers of a style vector: F_dyn, and with :class:`SpeechStyle` the share of its change."""
+        return sum(self.style_encoder.token_dims) + (self.speech_style is not None)
+
+    def style_from_speech(
+        self,
+        style: Float[Tensor, "batch style_dim"],
+        audio: Float[Tensor, "batch frames dim"],
+        mask: Bool[Tensor, "batch frames"],
+    ) -> Float[Tensor, "batch dynamic_dim"]:
+        """F_dyn of style vectors, with the change that the speech asks for where they want it."""
+        if self.speech_style is None:
+            return style
+        dynamic, share = style[:, :-1], style[:, -1:]
+        # Not asked where nothing is to be added: the map is unknown until training has begun. A graph cannot choose.
+        if not exporting() and not bool(share.any()):
+            return dynamic
+        return dynamic + share * self.speech_style(audio, mask).to(dynamic)
+
+    def conditions(
+        self,
+        batch: Batch,
+        identity: Int[Tensor, " batch"],
+        style: Float[Tensor, "batch style_dim"],
+        hidden: Bool[Tensor, " batch"] | None = None,
+        animated: slice | Tensor = slice(None),
+    ) -> Conditions:
+        """Everything that is computed once per clip.
+
+        Args:
+            batch: its speech, or cached features of it, and its lengths.
+            identity: identity indices, −1 for unknown.
+            style: style vectors, of :attr:`style_dim` numbers.
+            hidden: clips with a hidden dynamic style; None if no clip has.
+            animated: the frames that are animated, of speech that is encoded with more around them.
+        """
+        cached = batch.cached_features or ()
+        audio = self.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths, *cached)
+        check_shape(self.audio_encoder, audio, *batch.motion.shape[:2], self.dim)
+        mask = frame_mask(batch.frame_lengths, audio.shape[1])
+        encoded = dynamic_style = self.style_from_speech(style, audio[:, animated], mask[:, animated])
+        if self.training and self.speech_style is not None:
+            self.speech_style.update(audio.detach(), mask, encoded.detach(), identity)
+        # Chosen among given and learnt features, and not only where one is hidden: under several processes every weight
+        # needs a gradient in every step.
+        if hidden is not None and self.no_style is not None:
+            dynamic_style = torch.where(hidden[:, None], self.no_style.to(dynamic_style), dynamic_style)
+        tokens = self.style_tokens(torch.cat([self.identity_encoder(identity), dynamic_style], dim=-1))  # eq. 14
+        if self.template_token is not None:
+            tokens = torch.cat([tokens, self.template_token(batch.template)], dim=1)
+        return Conditions(audio, tokens, mask, dynamic=encoded)
+
+    def dynamic_style(
+        self, reference: Float[Tensor, "batch frames *numbers"], mask: Bool[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch dynamic_dim"]:
+        """F_dyn of scaled reference motion, or of its components (eq. 2 to 9); of width 0 without a dynamic style."""
+        if self.mesh_encoder is None:
+            return reference.new_zeros((len(reference), 0))
+        style = self.style_encoder(self.mesh_encoder(reference), mask)
+        check_shape(self.style_encoder, style, reference.shape[0], sum(self.style_encoder.token_dims))
+        return style
 
     def forward(
         self,
@@ -193,11 +243,7 @@ class DualPathNetwork(ConditionEncoding):
 
 
 class StepEmbedding(nn.Module):
-    """t_emb: sinusoids of the diffusion step, then an MLP.
-
-    Args:
-        dim: channels C.
-    """
+    """t_emb: sinusoids of the diffusion step, then an MLP."""
 
     frequencies: Tensor
 
@@ -277,15 +323,7 @@ class ConditionalDenoiser:
 
 
 class PreconditionedDenoiser(ConditionalDenoiser):
-    """Coordinates of motion with known variances; the network predicts the part that the noisy motion leaves open.
-
-    Args:
-        network: predicts that.
-        conditions: as :class:`ConditionalDenoiser` takes them.
-        preconditioning: the scales around the network.
-        mask: True on valid frames, one row for each row of the state.
-        blend: changes the predictions of every step.
-    """
+    """Coordinates of motion with known variances; the network predicts the part that the noisy motion leaves open."""
 
     def __init__(
         self,

@@ -61,7 +61,8 @@ class VertexObjective(TrainingObjective):
         rest of the step, so the last map, the losses and their gradients are computed block by block.
         """
         model, last = self.model, self.model.network.unembed
-        weight, bias = last.weight, last.bias
+        weight: Tensor = last.weight
+        bias: Tensor = last.bias
         if model.geometry is not None:  # linear in the last map, which is weighted in place of its result
             with torch.autocast(decoded.device.type, enabled=False):
                 weight, bias = model.geometry @ weight, model.geometry @ bias

@@ -11,15 +11,16 @@ import math
 from typing import Any, cast
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.data import Reference, SpeechMotionDataModule, collate
+from facediff.data import Batch, Reference, SpeechMotionDataModule, collate
 from facediff.errors import ArgumentError, FaceDiffError
-from facediff.models.dual_path.conditioning import ConditionedModel
+from facediff.models.base import AnimationModel
+from facediff.models.dual_path.conditioning import Conditions
 from facediff.models.dual_path.network import DualPathNetwork
-from facediff.models.dual_path.options import NumericScale
+from facediff.models.dual_path.options import DualPathOptions, NumericScale
 from facediff.models.inference import Expressivity, Style
 from facediff.models.invented_speakers import InventedSpeakers
 from facediff.models.mesh_encoders import ComponentMeshEncoder
@@ -120,11 +121,12 @@ def spread_for(first_noise: float, last_noise: float, share: float) -> float:
     return math.sqrt(1 + 8 * (last_noise_for(first_noise, last_noise, share) - last_noise) / first_noise)
 
 
-class DualPathRecipe(ConditionedModel):
-    """A dual-path model's measurements before its training, and the settings of its sampling."""
+class DualPathRecipe(AnimationModel):
+    """Measurements before a dual-path training, conditions that are hidden in it, and the settings of sampling."""
 
     low_latency_steps = LOW_LATENCY_STEPS
     network: DualPathNetwork
+    options: DualPathOptions
     motion_space: MotionSpace
     process: NoiseProcess
     sampler: Sampler
@@ -132,6 +134,24 @@ class DualPathRecipe(ConditionedModel):
     _trained_steps: int  # of the sampler that the model was made with
     _sampler_options: dict[str, Any] | None = None  # of the sampler chosen since; None for the model's own
     _step_weights: Tensor | None = None  # follow from the motion space, known when training begins
+
+    def conditions(self, batch: Batch, animated: slice | Tensor = slice(None)) -> Conditions:
+        """Everything that is computed once per clip; in training, identity and style are hidden now and then.
+
+        Args:
+            batch: the clips.
+            animated: the frames that are animated, of speech that is encoded with more around them.
+        """
+        identity, style = self.hide(len(batch)) if self.training else (None, None)
+        # Index −1 stands for an unseen speaker. Clips that are shown under it teach the model to take the person from
+        # the style alone.
+        identities = batch.identity if identity is None else batch.identity.masked_fill(identity, -1)
+        return self.network.conditions(batch, identities, self.style_of(batch), style, animated)
+
+    def hide(self, clips: int) -> list[Bool[Tensor, " batch"] | None]:
+        """Which training clips have a hidden identity, and which a hidden style; None if no clip does."""
+        shares = (self.options.identity_dropout, self.options.style_dropout)
+        return [torch.rand(clips, device=self.device) < share if share else None for share in shares]
 
     def step_weights(self) -> Float[Tensor, " steps"] | None:
         """Probabilities of the training steps; None where they are uniform, as in the paper."""

@@ -34,11 +34,6 @@ class SpeechStyle(nn.Module):
 
     Speech counts as it is animated: in a stream, each window asks by its own speech, and of windows of a second the
     answers vary by half as much as between clips.
-
-    Args:
-        dim: channels of the speech features.
-        style_dim: numbers of a style vector.
-        identities: training identities.
     """
 
     squares: Tensor
@@ -69,15 +64,7 @@ class SpeechStyle(nn.Module):
         identity: Int[Tensor, " batch"],
         memory: float = MEMORY,
     ) -> None:
-        """Take in the clips of a training step; clips of hidden identities are left out.
-
-        Args:
-            features: of their speech.
-            mask: True on valid frames.
-            style: their style vectors.
-            identity: indices, −1 for hidden.
-            memory: share of the statistics that stays.
-        """
+        """Take in the clips of a training step; clips of hidden identities are left out."""
         visible = identity >= 0
         style, identity = style.to(self.styles.dtype)[visible], identity[visible]
         with torch.autocast(features.device.type, enabled=False):

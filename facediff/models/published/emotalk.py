@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 from facediff import registry
 from facediff.errors import ArgumentError
-from facediff.models.audio_encoders import AudioEncoderFactory
+from facediff.models.audio_encoders import AudioEncoderFactory, by_length
 from facediff.models.graphs import SpeechInput
 from facediff.models.layers import Heads, Layers, Share, Width, exporting, interpolate_ends
 from facediff.models.published.autoregressive import DecoderLayer
 from facediff.models.published.base import DirectModel, SpeakerTable, still_map
 from facediff.models.published.positions import periodic_bias
-from facediff.models.speech_networks import Wav2Vec2Encoder, by_lengths
+from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.speech.windows import STEP_RATE
 from facediff.utils.ranges import Range
 
@@ -134,7 +134,7 @@ class EmoTalk(DirectModel):
                 n_frames = int(x.shape[1] / STEP_RATE * EMOTION_RATE)
             return interpolate_ends(encoder.hidden_states(interpolate_ends(x, max(1, n_frames))), count)
 
-        return by_lengths(features, steps, frames, encode)
+        return by_length(features, steps, encode, frames)[0]
 
     def decode(self, features: Tensor, weights: Tensor, frames: Int[Tensor, " batch"] | None) -> Tensor:
         """Every frame sees those before it, and its own moment of the emotion; later frames and padding change none."""

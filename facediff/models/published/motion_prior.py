@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from facediff.models.audio_encoders import by_length
 from facediff.models.published.positions import periodic_positions
-from facediff.models.speech_networks import by_lengths
 
 
 class PriorBlock(nn.Module):
@@ -164,11 +164,11 @@ class MotionPrior(nn.Module):
 
     def encode_clips(self, motion: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:
         """Tokens of padded clips (B, T, 3V), each as if it were alone."""
-        return by_lengths(motion, frames, frames, lambda x, _: self.encode(x))
+        return by_length(motion, frames, self.encode)[0]
 
     def decode_clips(self, values: Tensor, frames: Int[Tensor, " batch"]) -> Tensor:
         """Motion of padded clips of codes, each as if it were alone."""
-        return by_lengths(values, frames, frames, lambda x, _: self.decode(x))
+        return by_length(values, frames, self.decode)[0]
 
 
 def perplexity(numbers: Int[Tensor, " tokens"], codes: int) -> Float[Tensor, ""]:

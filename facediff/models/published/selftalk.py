@@ -26,7 +26,7 @@ from facediff.models.audio_encoders import (
     StepRule,
     Waves,
     by_length,
-    load_recogniser,
+    load_typed,
     standardise,
 )
 from facediff.models.evaluation import IdentityPolicy
@@ -364,7 +364,9 @@ class TextNetwork(nn.Module):
 
     def __init__(self, source: str, config: dict[str, Any] | None) -> None:
         super().__init__()
-        self.network: PreTrainedModel = load_recogniser(source, config, option="model.text_source")
+        self.network: PreTrainedModel = load_typed(
+            source, config, "ForCTC", "recogniser with a CTC head", encoder="ctc", option="model.text_source"
+        )
         self.network.requires_grad_(False)
         self.network.eval()
         settings = self.network.config

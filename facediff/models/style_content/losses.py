@@ -24,57 +24,43 @@ EPSILON = 1e-6
 """Added to denominators and under roots, so that gradients are finite."""
 
 
-class MotionDistance:
-    """How far two motions are apart: positions, velocities, the gap between the inner lips.
-
-    Mean squared differences; 0 for equal motions.
+def motion_distance(
+    motion: Motion,
+    truth: Motion,
+    mask: Mask,
+    weights: Sequence[float],
+    *,
+    vertices: Int[Tensor, " region"] | None = None,
+    rest: Float[Tensor, "batch points dims"] | None = None,
+    pairs: Int[Tensor, "pairs 2"] | None = None,
+) -> Float[Tensor, ""]:
+    """How far two motions are apart: weighted mean squared differences; 0 for equal motions.
 
     Args:
-        position: weight of the positions.
-        velocity: weight of the differences from frame to frame.
-        lip_gap: weight of the distance between the inner lips; looked at where the corpus says which vertices they are.
+        motion: offsets from the template.
+        truth: their target.
+        mask: frames that count.
+        weights: of the positions, of the differences from frame to frame, and of the distance between the inner lips.
+        vertices: vertices that count; all if None.
+        rest: the templates in the motion's unit, for that distance.
+        pairs: upper and lower vertices of the inner lips; None if the corpus lists none.
     """
-
-    def __init__(self, position: float, velocity: float, lip_gap: float) -> None:
-        self.position = position
-        self.velocity = velocity
-        self.lip_gap = lip_gap
-
-    def __call__(
-        self,
-        motion: Motion,
-        truth: Motion,
-        mask: Mask,
-        *,
-        vertices: Int[Tensor, " region"] | None = None,
-        rest: Float[Tensor, "batch points dims"] | None = None,
-        pairs: Int[Tensor, "pairs 2"] | None = None,
-    ) -> Float[Tensor, ""]:
-        """The weighted sum.
-
-        Args:
-            motion: offsets from the template.
-            truth: their target.
-            mask: frames that count.
-            vertices: vertices that count; all if None.
-            rest: the templates in the motion's unit, for the gap.
-            pairs: upper and lower vertices of the inner lips.
-        """
-        gap = motion.new_zeros(())
-        if self.lip_gap and pairs is not None and rest is not None:
-            gap = frame_mean((_gaps(motion, rest, pairs) - _gaps(truth, rest, pairs)).square().mean(-1), mask)
-        columns = None
-        if vertices is not None:
-            columns = torch.zeros(motion.shape[2], motion.shape[3], dtype=torch.bool, device=motion.device)
-            columns = columns.index_fill(0, vertices, True).flatten()
-        squares = squared_errors(motion.flatten(2), truth.flatten(2), mask, columns)
-        width = motion.shape[3] * (motion.shape[2] if vertices is None else len(vertices))
-        moved, changed = (
-            total / (valid.sum() * width).clamp_min(1)
-            for total, valid in zip(squares, (mask, neighbours(mask)), strict=True)
-        )
-        total = self.position * moved + self.velocity * changed
-        return total + self.lip_gap * gap
+    columns = None
+    if vertices is not None:
+        columns = torch.zeros(motion.shape[2], motion.shape[3], dtype=torch.bool, device=motion.device)
+        columns = columns.index_fill(0, vertices, True).flatten()
+    squares = squared_errors(motion.flatten(2), truth.flatten(2), mask, columns)
+    width = motion.shape[3] * (motion.shape[2] if vertices is None else len(vertices))
+    moved, changed = (
+        total / (valid.sum() * width).clamp_min(1)
+        for total, valid in zip(squares, (mask, neighbours(mask)), strict=True)
+    )
+    position, velocity, lip_gap = weights
+    total = position * moved + velocity * changed
+    if not lip_gap or pairs is None or rest is None:
+        return total
+    gap = (_gaps(motion, rest, pairs) - _gaps(truth, rest, pairs)).square().mean(-1)
+    return total + lip_gap * frame_mean(gap, mask)
 
 
 def _gaps(motion: Motion, rest: Tensor, pairs: Tensor) -> Float[Tensor, "batch frames pairs"]:

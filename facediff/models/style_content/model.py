@@ -8,10 +8,8 @@ D turns both into motion again, whether the content comes from motion or from sp
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,133 +19,22 @@ from facediff import registry
 from facediff.data import Assets, Batch, SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.hyperparameters import takes_options, with_classes
-from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
-from facediff.models.base import AnimationModel, Decay
+from facediff.models.base import AnimationModel
 from facediff.models.graphs import BATCH, FRAMES, Graph, Graphs, ModelPart, results_of, speech_graph, style_graphs
 from facediff.models.inference import Progress
-from facediff.models.layers import Heads, Weight, Width, frame_mask
+from facediff.models.layers import frame_mask
 from facediff.models.losses import style_contrast
-from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
-from facediff.models.speaker_encoders import LstmStyle, StyleEncoderFactory
 from facediff.models.style_content.losses import (
     Alignments,
-    MotionDistance,
     Pairing,
     dynamics_distance,
+    motion_distance,
     pair_up,
     relative_distance,
     squared_distance,
     style_distance,
 )
-from facediff.models.style_content.network import DisentanglementNetwork, StyleContentDecoder, WindowedTransformer
-from facediff.utils.ranges import Range
-
-SPEECH_TERMS = ("reconstruction", "swap", "cycle", "swap_dynamics")
-"""Terms that the speech network has as well, by the name ``speech_<term>``."""
-
-
-@dataclass(kw_only=True)
-class StyleContentOptions:
-    """Options of :class:`StyleContentDisentanglement`; ablations are one override each.
-
-    ``swap_weight=0``, ``cycle_weight=0``, ``aligned_pairs=false`` and ``speech_content_weight=0``.
-
-    Args:
-        dim: channels of speech features and of motion features before the style encoder.
-        content_dim: channels of the content.
-        audio_encoder: speech to features.
-        mesh_encoder: motion to one feature per frame, made once for content and once for style.
-        style_encoder: these features to the style vector.
-        window_seconds: length of the speech window around each frame.
-        speech_rate: speech features a second in the window; as many as motion has frames if None.
-        speech_layers: encoder layers over the window.
-        speech_heads: attention heads of these.
-        decoder_channels: channels of the decoder's three convolutions.
-        decoder_kernels: their taps.
-        decoder_hidden: channels of its fully connected layers before the coefficients.
-        basis_size: coefficients of its linear basis, which starts from the principal components of the training motion.
-        content_scale: ``clip`` removes mean and spread over a clip from the content of motion, by which a speaker
-            would be recognised; ``free`` leaves it as it is.
-        vertices: input of the encoders and of the losses: all vertices, or the corpus's region ``face``
-            (``data.face``), e.g. without FLAME's eyeballs. The decoder moves all of them.
-        aligned_pairs: where two speakers say the same sentence, supervise a swap of their styles with the other's
-            recording, aligned in time; else, and everywhere if False, by the encoders' consistency.
-        aligned_windows: with ``data.window``, let the windows of two clips that say the same begin at the same sound,
-            so that they are aligned pairs as whole clips are; else windows are never aligned.
-        window_context: with ``data.window``, read the frames around a training window that the decoder's kernels and
-            the speech windows reach; they are seen, and no loss counts them. Else a window is like a clip of its own.
-        swap_region: the vertices where such a recording supervises.
-        reconstruction_weight: of motion from its own content and style.
-        swap_weight: of motion from its own content and the partner's style.
-        cycle_weight: of swapping twice.
-        swap_dynamics_weight: of the swapped upper face's spread over time against the partner's.
-        speech_weight: factor of the same terms with content from speech.
-        speech_query: what asks the window for the content of its middle frame: the ``encoded`` feature in the middle,
-            or the ``input`` feature, as the patent words it.
-        speech_style: the style that content from speech is decoded with in training: of another clip of the speaker,
-            as in animation, or the clip's own, as content from motion is.
-        content_pull: how contents are compared: their mean squared difference as a share of their variance, or as it
-            is (``squared``).
-        style_pull: how an identity's styles are pulled together: against all other identities' (``contrast``), or by
-            their mean squared difference alone (``squared``).
-        recording_content_weight: pulls the contents of two aligned recordings of a sentence together.
-        identity_style_weight: pulls the styles of an identity's clips together; see ``style_pull``.
-        speech_content_weight: pulls content from speech to content from motion.
-        position_weight: of positions within each comparison of motions.
-        velocity_weight: of velocities within it.
-        lip_gap_weight: of the gap between the inner lips within it.
-        weight_decay: decoupled weight decay.
-    """
-
-    dim: Width = 64
-    content_dim: Width = 64
-    audio_encoder: AudioEncoderFactory = MelEncoder
-    mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder
-    style_encoder: StyleEncoderFactory = LstmStyle
-    window_seconds: Annotated[float, Range(0, 10)] = 0.64
-    speech_rate: Annotated[float, Range(1, 1000)] | None = None
-    speech_layers: Annotated[int, Range(0, 256)] = 3
-    speech_heads: Heads = 4
-    decoder_channels: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (64, 128, 256)
-    decoder_kernels: Annotated[Sequence[int], Range(1, 1000, items=(0, 32))] = (5, 3, 3)
-    decoder_hidden: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (256, 256, 128)
-    basis_size: Width = 50
-    content_scale: Literal["clip", "free"] = "clip"
-    vertices: Literal["all", "face"] = "all"
-    aligned_pairs: bool = True
-    aligned_windows: bool = False
-    window_context: bool = False
-    swap_region: Literal["lower_face", "face"] = "lower_face"
-    reconstruction_weight: Weight = 1.0
-    swap_weight: Weight = 3.0
-    cycle_weight: Weight = 1.0
-    swap_dynamics_weight: Weight = 3.0
-    speech_weight: Weight = 2.0
-    speech_query: Literal["encoded", "input"] = "encoded"
-    speech_style: Literal["other_clip", "own"] = "other_clip"
-    content_pull: Literal["relative", "squared"] = "relative"
-    style_pull: Literal["contrast", "squared"] = "contrast"
-    recording_content_weight: Weight = 5.0
-    identity_style_weight: Weight = 10.0
-    speech_content_weight: Weight = 5.0
-    position_weight: Weight = 1.0
-    velocity_weight: Weight = 5.0
-    lip_gap_weight: Weight = 1.0
-    weight_decay: Decay = 0.0
-
-    @property
-    def weights(self) -> dict[str, float]:
-        """The weight of every term; the terms of (4.2) have the factor ``speech_weight``."""
-        weights = {
-            "reconstruction": self.reconstruction_weight,
-            "swap": self.swap_weight,
-            "cycle": self.cycle_weight,
-            "swap_dynamics": self.swap_dynamics_weight,
-            "recording_content": self.recording_content_weight,
-            "identity_style": self.identity_style_weight,
-            "speech_content": self.speech_content_weight,
-        }
-        return weights | {f"speech_{term}": self.speech_weight * weights[term] for term in SPEECH_TERMS}
+from facediff.models.style_content.network import DisentanglementNetwork, StyleContentOptions
 
 
 @registry.model.register("StyleContentDisentanglement")
@@ -171,41 +58,9 @@ class StyleContentDisentanglement(AnimationModel):
         relative, contrast = options.content_pull == "relative", options.style_pull == "contrast"
         self.content_distance = relative_distance if relative else squared_distance
         self.style_pull = style_contrast if contrast else style_distance
-        self.distance = MotionDistance(options.position_weight, options.velocity_weight, options.lip_gap_weight)
         self.alignments = Alignments(self.frame_rate)
-        dim, content_dim, points = options.dim, options.content_dim, {"n_vertices": self.n_vertices, "dims": self.dims}
-        rate = options.speech_rate or self.frame_rate
-        style = options.style_encoder(dim=dim)
-        if not style.token_dims:
-            raise FaceDiffError("style_encoder: this model needs a style; choose another style encoder, such as lstm")
-        self.network = DisentanglementNetwork(
-            content_encoder=options.mesh_encoder(dim=content_dim, **points),
-            style_frames=options.mesh_encoder(dim=dim, **points),
-            style_encoder=style,
-            audio_encoder=options.audio_encoder(dim=dim),
-            speech_content=WindowedTransformer(
-                in_dim=dim,
-                dim=dim,
-                out_dim=content_dim,
-                window=max(1, round(options.window_seconds * rate)),
-                num_heads=options.speech_heads,
-                num_layers=options.speech_layers,
-                query=options.speech_query,
-            ),
-            decoder=StyleContentDecoder(
-                **points,
-                content_dim=content_dim,
-                style_dim=sum(style.token_dims),
-                channels=options.decoder_channels,
-                kernels=options.decoder_kernels,
-                hidden=options.decoder_hidden,
-                basis_size=options.basis_size,
-            ),
-            standardise_content=options.content_scale == "clip",
-            speech_rate=options.speech_rate,
-            frame_rate=self.frame_rate,
-            n_vertices=self.n_vertices if options.vertices == "face" else None,
-        )
+        points = {"n_vertices": self.n_vertices, "dims": self.dims}
+        self.network = DisentanglementNetwork(options, **points, frame_rate=self.frame_rate)
 
     def personal_modules(self) -> list[nn.Module]:
         """The style encoder, and the decoder: its basis holds the shapes of a face."""
@@ -223,7 +78,7 @@ class StyleContentDisentanglement(AnimationModel):
             if new:
                 mean, shapes = data.principal_motion(self.network.decoder.basis.in_features)
                 self.network.decoder.start_from(mean * self.scale, shapes * self.scale)
-            if self.distance.lip_gap and self.assets.inner_lip_pairs is None:
+            if self.options.lip_gap_weight and self.assets.inner_lip_pairs is None:
                 print(
                     f"note: lip_gap_weight has no effect: {data.source} has no regions/inner_lip_pairs.txt",
                     flush=True,
@@ -342,11 +197,12 @@ class StyleContentDisentanglement(AnimationModel):
         self, batch: Batch, motion: Tensor, truth: Tensor, mask: Tensor, vertices: Tensor | None = None
     ) -> Tensor:
         """The distance of scaled motions on the frames of a mask and some vertices, or the face if None."""
-        pairs = self.assets.inner_lip_pairs
-        return self.distance(
+        pairs, options = self.assets.inner_lip_pairs, self.options
+        return motion_distance(
             motion,
             truth,
             mask,
+            (options.position_weight, options.velocity_weight, options.lip_gap_weight),
             vertices=self.face() if vertices is None else vertices,
             rest=batch.template * self.scale,
             pairs=None if pairs is None else pairs.to(motion.device),
@@ -375,12 +231,6 @@ class StyleContentDisentanglement(AnimationModel):
         """Style vectors of reference motions."""
         return self.network.style(reference * self.scale, mask)
 
-    def encode_content(
-        self, motion: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch frames content_dim"]:
-        """Content of motion, independent of the speaker; zero on padding."""
-        return self.network.content(motion * self.scale, mask)
-
     def decode(
         self,
         content: Float[Tensor, "batch frames content_dim"],
@@ -391,8 +241,36 @@ class StyleContentDisentanglement(AnimationModel):
         return self.decode_scaled(content, style, mask) / self.scale * mask[..., None, None]
 
     def graphs(self) -> Graphs:
-        """Speech to content, and content with a style to motion."""
-        return graphs_of(self)
+        """Speech to content, and content with a style to motion (:mod:`facediff.models.graphs`)."""
+        network = self.network
+        ratio = Fraction(network.ratio).limit_denominator(1000)
+
+        def steps_of(frames: int) -> int:
+            # A step more where the ratio is no whole number: it lies beyond the valid steps, and is zero.
+            return frames * ratio.numerator // ratio.denominator + (ratio.denominator > 1)
+
+        speech = speech_graph(self, network.content_of, steps_of)
+        features = results_of(speech)
+        batch, frames = features.shape[:2]
+        width = sum(network.style_encoder.token_dims)
+        motion = Graph(
+            "motion",
+            ContentMotionGraph(self),
+            {
+                "features": features,
+                "mask": torch.ones(batch, frames, dtype=torch.bool),
+                "style": torch.zeros(batch, width),
+            },
+            {"features": FRAMES, "mask": FRAMES, "style": BATCH},
+            ("offsets",),
+        )
+        return Graphs(
+            parts=[speech, motion, *style_graphs(self, width)],
+            equal_lengths=not network.audio_encoder.takes_padding,
+            blending="motion",
+            clock=self.clock,
+            style="reference",
+        )
 
     def generate_clips(
         self, batch: Batch, *, seed: int = 0, progress: Progress | None = None
@@ -415,36 +293,3 @@ class ContentMotionGraph(ModelPart[StyleContentDisentanglement]):
     ) -> Float[Tensor, "batch frames points dims"]:
         """In the unit of the corpus."""
         return self.model.decode(features, style, mask)
-
-
-def graphs_of(model: StyleContentDisentanglement) -> Graphs:
-    """The model as graphs: speech to content, content and style to motion (:mod:`facediff.models.graphs`)."""
-    network = model.network
-    ratio = Fraction(network.ratio).limit_denominator(1000)
-
-    def steps_of(frames: int) -> int:
-        # A step more where the ratio is no whole number: it lies beyond the valid steps, and is zero.
-        return frames * ratio.numerator // ratio.denominator + (ratio.denominator > 1)
-
-    speech = speech_graph(model, network.content_of, steps_of)
-    features = results_of(speech)
-    batch, frames = features.shape[:2]
-    width = sum(network.style_encoder.token_dims)
-    motion = Graph(
-        "motion",
-        ContentMotionGraph(model),
-        {
-            "features": features,
-            "mask": torch.ones(batch, frames, dtype=torch.bool),
-            "style": torch.zeros(batch, width),
-        },
-        {"features": FRAMES, "mask": FRAMES, "style": BATCH},
-        ("offsets",),
-    )
-    return Graphs(
-        parts=[speech, motion, *style_graphs(model, width)],
-        equal_lengths=not network.audio_encoder.takes_padding,
-        blending="motion",
-        clock=model.clock,
-        style="reference",
-    )

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.models.audio_encoders import AudioEncoder
+from facediff.errors import FaceDiffError
+from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
+from facediff.models.base import Decay
 from facediff.models.graphs import SpeechInput
-from facediff.models.layers import Attention, FeedForward, sliding
-from facediff.models.mesh_encoders import MeshEncoder
-from facediff.models.speaker_encoders import StyleEncoder
+from facediff.models.layers import Attention, FeedForward, Heads, Weight, Width, sliding
+from facediff.models.mesh_encoders import MeshEncoderFactory, SpiralMeshEncoder
+from facediff.models.speaker_encoders import LstmStyle, StyleEncoderFactory
+from facediff.utils.ranges import Range
 
 SLOPE = 0.2
 """Of the leaky ReLU after each layer of the decoder."""
@@ -23,51 +27,154 @@ EPSILON = 1e-5
 """Added to the variance of the content before its root is taken."""
 
 
-class DisentanglementNetwork(nn.Module):
-    """Encoders of content and style, and the one decoder that motion and speech share.
+SPEECH_TERMS = ("reconstruction", "swap", "cycle", "swap_dynamics")
+"""Terms that the speech network has as well, by the name ``speech_<term>``."""
+
+
+@dataclass(kw_only=True)
+class StyleContentOptions:
+    """Options of :class:`StyleContentDisentanglement`; ablations are one override each.
+
+    ``swap_weight=0``, ``cycle_weight=0``, ``aligned_pairs=false`` and ``speech_content_weight=0``.
 
     Args:
-        content_encoder: motion to one feature per frame, E_C.
-        style_frames: motion to one feature per frame, the first half of E_S.
-        style_encoder: these features to one style vector, the second half of E_S.
-        audio_encoder: speech to one feature per frame.
-        speech_content: features of speech to content.
-        decoder: content and style to motion, D.
-        standardise_content: remove mean and spread over a clip's time from the content of motion.
-        speech_rate: speech features a second; as many as motion has frames if None.
-        frame_rate: motion frames a second.
-        n_vertices: vertices of which :attr:`visible` says whether the encoders see them; they see all if None.
+        dim: channels of speech features and of motion features before the style encoder.
+        content_dim: channels of the content.
+        audio_encoder: speech to features.
+        mesh_encoder: motion to one feature per frame, made once for content and once for style.
+        style_encoder: these features to the style vector.
+        window_seconds: length of the speech window around each frame.
+        speech_rate: speech features a second in the window; as many as motion has frames if None.
+        speech_layers: encoder layers over the window.
+        speech_heads: attention heads of these.
+        decoder_channels: channels of the decoder's three convolutions.
+        decoder_kernels: their taps.
+        decoder_hidden: channels of its fully connected layers before the coefficients.
+        basis_size: coefficients of its linear basis, which starts from the principal components of the training motion.
+        content_scale: ``clip`` removes mean and spread over a clip from the content of motion, by which a speaker
+            would be recognised; ``free`` leaves it as it is.
+        vertices: input of the encoders and of the losses: all vertices, or the corpus's region ``face``
+            (``data.face``), e.g. without FLAME's eyeballs. The decoder moves all of them.
+        aligned_pairs: where two speakers say the same sentence, supervise a swap of their styles with the other's
+            recording, aligned in time; else, and everywhere if False, by the encoders' consistency.
+        aligned_windows: with ``data.window``, let the windows of two clips that say the same begin at the same sound,
+            so that they are aligned pairs as whole clips are; else windows are never aligned.
+        window_context: with ``data.window``, read the frames around a training window that the decoder's kernels and
+            the speech windows reach; they are seen, and no loss counts them. Else a window is like a clip of its own.
+        swap_region: the vertices where such a recording supervises.
+        reconstruction_weight: of motion from its own content and style.
+        swap_weight: of motion from its own content and the partner's style.
+        cycle_weight: of swapping twice.
+        swap_dynamics_weight: of the swapped upper face's spread over time against the partner's.
+        speech_weight: factor of the same terms with content from speech.
+        speech_query: what asks the window for the content of its middle frame: the ``encoded`` feature in the middle,
+            or the ``input`` feature, as the patent words it.
+        speech_style: the style that content from speech is decoded with in training: of another clip of the speaker,
+            as in animation, or the clip's own, as content from motion is.
+        content_pull: how contents are compared: their mean squared difference as a share of their variance, or as it
+            is (``squared``).
+        style_pull: how an identity's styles are pulled together: against all other identities' (``contrast``), or by
+            their mean squared difference alone (``squared``).
+        recording_content_weight: pulls the contents of two aligned recordings of a sentence together.
+        identity_style_weight: pulls the styles of an identity's clips together; see ``style_pull``.
+        speech_content_weight: pulls content from speech to content from motion.
+        position_weight: of positions within each comparison of motions.
+        velocity_weight: of velocities within it.
+        lip_gap_weight: of the gap between the inner lips within it.
+        weight_decay: decoupled weight decay.
     """
+
+    dim: Width = 64
+    content_dim: Width = 64
+    audio_encoder: AudioEncoderFactory = MelEncoder
+    mesh_encoder: MeshEncoderFactory = SpiralMeshEncoder
+    style_encoder: StyleEncoderFactory = LstmStyle
+    window_seconds: Annotated[float, Range(0, 10)] = 0.64
+    speech_rate: Annotated[float, Range(1, 1000)] | None = None
+    speech_layers: Annotated[int, Range(0, 256)] = 3
+    speech_heads: Heads = 4
+    decoder_channels: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (64, 128, 256)
+    decoder_kernels: Annotated[Sequence[int], Range(1, 1000, items=(0, 32))] = (5, 3, 3)
+    decoder_hidden: Annotated[Sequence[int], Range(1, 16_384, items=(0, 32))] = (256, 256, 128)
+    basis_size: Width = 50
+    content_scale: Literal["clip", "free"] = "clip"
+    vertices: Literal["all", "face"] = "all"
+    aligned_pairs: bool = True
+    aligned_windows: bool = False
+    window_context: bool = False
+    swap_region: Literal["lower_face", "face"] = "lower_face"
+    reconstruction_weight: Weight = 1.0
+    swap_weight: Weight = 3.0
+    cycle_weight: Weight = 1.0
+    swap_dynamics_weight: Weight = 3.0
+    speech_weight: Weight = 2.0
+    speech_query: Literal["encoded", "input"] = "encoded"
+    speech_style: Literal["other_clip", "own"] = "other_clip"
+    content_pull: Literal["relative", "squared"] = "relative"
+    style_pull: Literal["contrast", "squared"] = "contrast"
+    recording_content_weight: Weight = 5.0
+    identity_style_weight: Weight = 10.0
+    speech_content_weight: Weight = 5.0
+    position_weight: Weight = 1.0
+    velocity_weight: Weight = 5.0
+    lip_gap_weight: Weight = 1.0
+    weight_decay: Decay = 0.0
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """The weight of every term; the terms of (4.2) have the factor ``speech_weight``."""
+        weights = {
+            "reconstruction": self.reconstruction_weight,
+            "swap": self.swap_weight,
+            "cycle": self.cycle_weight,
+            "swap_dynamics": self.swap_dynamics_weight,
+            "recording_content": self.recording_content_weight,
+            "identity_style": self.identity_style_weight,
+            "speech_content": self.speech_content_weight,
+        }
+        return weights | {f"speech_{term}": self.speech_weight * weights[term] for term in SPEECH_TERMS}
+
+
+class DisentanglementNetwork(nn.Module):
+    """Encoders of content and style, and the one decoder that motion and speech share."""
 
     visible: Tensor | None
 
-    def __init__(
-        self,
-        *,
-        content_encoder: MeshEncoder,
-        style_frames: MeshEncoder,
-        style_encoder: StyleEncoder,
-        audio_encoder: AudioEncoder,
-        speech_content: WindowedTransformer,
-        decoder: StyleContentDecoder,
-        standardise_content: bool,
-        speech_rate: float | None = None,
-        frame_rate: float = 25.0,
-        n_vertices: int | None = None,
-    ) -> None:
+    def __init__(self, options: StyleContentOptions, *, n_vertices: int, dims: int, frame_rate: float) -> None:
         super().__init__()
-        self.content_encoder = content_encoder
-        self.style_frames = style_frames
+        self.standardise_content = options.content_scale == "clip"
+        self.frame_rate, self.speech_rate = frame_rate, options.speech_rate or frame_rate
+        dim, points = options.dim, {"n_vertices": n_vertices, "dims": dims}
+        style_encoder = options.style_encoder(dim=dim)  # first, since the order decides its random weights
+        if not style_encoder.token_dims:
+            raise FaceDiffError("style_encoder: this model needs a style; choose another style encoder, such as lstm")
+        # Motion to one feature per frame: E_C, and the first half of E_S.
+        self.content_encoder = options.mesh_encoder(dim=options.content_dim, **points)
+        self.style_frames = options.mesh_encoder(dim=dim, **points)
         self.style_encoder = style_encoder
-        self.audio_encoder = audio_encoder
-        self.speech_content = speech_content
-        self.decoder = decoder
-        self.standardise_content = standardise_content
-        self.speech_rate = frame_rate if speech_rate is None else speech_rate
-        self.frame_rate = frame_rate
+        self.audio_encoder = options.audio_encoder(dim=dim)
+        self.speech_content = WindowedTransformer(
+            in_dim=dim,
+            dim=dim,
+            out_dim=options.content_dim,
+            window=max(1, round(options.window_seconds * self.speech_rate)),
+            num_heads=options.speech_heads,
+            num_layers=options.speech_layers,
+            query=options.speech_query,
+        )
+        self.decoder = StyleContentDecoder(
+            **points,
+            content_dim=options.content_dim,
+            style_dim=sum(style_encoder.token_dims),
+            channels=options.decoder_channels,
+            kernels=options.decoder_kernels,
+            hidden=options.decoder_hidden,
+            basis_size=options.basis_size,
+        )
         # 1 for vertices that the encoders see, else 0. It follows from the corpus's regions, which a checkpoint keeps,
         # so it is not saved with the weights.
-        self.register_buffer("visible", None if n_vertices is None else torch.ones(n_vertices), persistent=False)
+        visible = torch.ones(n_vertices) if options.vertices == "face" else None
+        self.register_buffer("visible", visible, persistent=False)
 
     def content(
         self, motion: Float[Tensor, "batch frames points dims"], mask: Bool[Tensor, "batch frames"]
@@ -250,14 +357,7 @@ class WindowedTransformer(nn.Module):
         ratio: float = 1.0,
         lengths: Int[Tensor, " batch"] | None = None,
     ) -> Float[Tensor, "batch frames window dim"]:
-        """Each frame's neighbours, zeros past the ends.
-
-        Args:
-            features: of the speech.
-            frames: frames of motion; as many as features if None.
-            ratio: features a frame.
-            lengths: valid features of each clip; as many as the longest has if None.
-        """
+        """Each frame's neighbours, zeros past the ends."""
         after = self.window - 1 - self.before
         padded = nn.functional.pad(features, (0, 0, self.before, after))
         around = sliding(padded, self.window, 1, features.shape[1])
