@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from facediff.errors import ArgumentError, FaceDiffError, needs_extra
+from facediff.errors import ArgumentError, FaceDiffError, damaged, needs_extra
 from facediff.models.layers import Frames, Share, Width, exporting, frame_mask, interpolate_frames, longest
 from facediff.registry import audio_encoder
 from facediff.speech.cepstra import mel_filters
@@ -581,8 +581,10 @@ def load_typed(
     with needs_extra("transformers", "train", f"the {encoder} audio encoder"):
         import transformers
     path = os.path.expanduser(source)
+    stated = f'{option}: {what} "{source}"' if config is None else "audio_encoder.config"
+    remedy = "give a directory that holds config.json and model.safetensors, or go online once to fetch it"
     if config is None:
-        with unreadable(source, what, option):
+        with damaged(stated, remedy, Exception):
             kind = transformers.PretrainedConfig.get_config_dict(path)[0].get("model_type")
     else:
         kind = config.get("model_type")
@@ -593,12 +595,12 @@ def load_typed(
         )
     network: type[PreTrainedModel] = getattr(transformers, f"{NETWORKS[kind]}{head}")
     if config is not None:
-        with unreadable("config.json", what, "audio_encoder.config"):
+        with damaged(stated, remedy, Exception):
             return network(known_options(getattr(transformers, f"{NETWORKS[kind]}Config"), config))
     bar = transformers.utils.logging.is_progress_bar_enabled()
     transformers.utils.logging.disable_progress_bar()
     try:
-        with unreadable(source, what, option):
+        with damaged(stated, remedy, Exception):
             model, info = network.from_pretrained(path, output_loading_info=True, dtype=torch.float32)
     finally:
         if bar:
@@ -619,16 +621,3 @@ def known_options(kind: Any, config: dict[str, Any]) -> Any:  # noqa: ANN401 - o
     # A configuration may name code on the hub (an attention kernel, a model class) in keys of its own.
     options = kind().to_dict()
     return kind.from_dict({key: value for key, value in config.items() if key in options})
-
-
-@contextmanager
-def unreadable(source: str, what: str, option: str) -> Iterator[None]:
-    """Name the source and the option that gave it in an error of loading."""
-    try:
-        yield
-    except Exception as error:  # the hub, safetensors, pickle and transformers raise anything
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FaceDiffError(
-            f'{option}: cannot load {what} from "{source}" ({reason}); give a directory that holds config.json and '
-            f"model.safetensors, or go online once to fetch it"
-        ) from error

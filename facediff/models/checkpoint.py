@@ -23,7 +23,7 @@ import io
 import os
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -32,7 +32,7 @@ import torch
 
 from facediff.data import SpeechMotionDataModule
 from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY, Assets
-from facediff.errors import FaceDiffError, choices
+from facediff.errors import FaceDiffError, choices, damaged
 from facediff.hyperparameters import Components, read_options, unknown_class
 from facediff.models.checkpoint_content import FACES_KEY, CheckpointContent
 from facediff.models.earlier_versions import without_removed_options
@@ -41,26 +41,17 @@ from facediff.registry import COMPONENTS, corpus, find_class, model
 from facediff.spaces import Space
 from facediff.utils.hints import is_name
 from facediff.utils.hub import model_path, split_face
-from facediff.utils.limits import brief, quoted
+from facediff.utils.limits import quoted
 from facediff.utils.torch_files import EXPECTED, load_tensors
 
 FACES_PREFIX = "further_faces."
 """Beginning of the names of these faces' weights, in front of the face's name."""
 
 
-@contextmanager
-def naming(path: object) -> Iterator[None]:
+def naming(path: object) -> AbstractContextManager[None]:
     """Errors of reading a damaged content become a sentence that names the file."""
-    try:
-        yield
-    except Exception as error:
-        problem = str(error)
-        if not isinstance(error, FaceDiffError):
-            problem = (
-                f"cannot be read as a model ({brief(error)}); the file is damaged, or install the packages that its "
-                f"components come from, in the versions that wrote it"
-            )
-        raise FaceDiffError(problem if str(path) in problem else f"{path}: {problem}") from error
+    packages = "or install the packages that its components come from, in the versions that wrote it"
+    return damaged(path, f"the file is damaged, {packages}", Exception)
 
 
 def read_checkpoint(path: str | os.PathLike[str] | IO[bytes]) -> dict[str, Any]:

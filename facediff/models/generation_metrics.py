@@ -301,8 +301,7 @@ class Measurement:
                     self._update("own_reference", {"prediction": generated[number], "identities": numbers})
 
     def _views(self, clip: Clip, sample: Sample) -> list[tuple[str, Sample]]:
-        views = []
-        data = self.corpus.data
+        views, data = [], self.corpus.data
         for whose, source in self.corpus.references(clip, sample.reference_name).items():
             reference = sample.reference
             if whose != "own":
