@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from facediff.evaluation.articulation import by_speaker
 
 from facediff.data.articulation import MouthMotion, area_under_curve, articulation, mouth_motion
 from facediff.speech.phonemes import TimedPhoneme
