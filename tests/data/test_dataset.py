@@ -13,7 +13,7 @@ import torch
 
 from facediff.data.dataset import MotionDataset, Pick
 from facediff.errors import FaceDiffError
-from tests.fakes.tiny import Tiny, write_tiny
+from tests.fakes.tiny import Tiny
 
 
 def test_motion_is_offsets_from_the_identitys_template(tiny: Tiny) -> None:
@@ -149,24 +149,6 @@ def test_only_the_epoch_that_was_stopped_is_continued_within(tiny_root: Path) ->
 
 def test_unknown_people_have_identity_minus_one(tiny: Tiny) -> None:
     assert {sample.identity for sample in tiny.dataset("test_b")} == {-1}
-
-
-def test_the_motion_scale_gives_unit_variance(tiny: Tiny) -> None:
-    # The miniature's clips are shorter than the number of frames that the scale is measured on, or little longer.
-    motion = np.concatenate(
-        [
-            s.motion.double().numpy().ravel()
-            for s in MotionDataset(
-                tiny.corpus, tiny.clips("train"), tiny.identities, tiny.reference_policy(), training=False
-            )
-        ]
-    )
-    assert tiny.motion_scale() * np.sqrt((motion**2).mean()) == pytest.approx(1.0, rel=0.05)
-
-
-@pytest.fixture
-def broken(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path / "broken")
 
 
 def test_newcomers_train_on_their_clips_of_no_split(tiny_root: Path) -> None:
