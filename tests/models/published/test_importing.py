@@ -162,6 +162,9 @@ def test_options_come_from_one_file_too(tmp_path: Path) -> None:
     assert made.audio_encoder.epsilon == 1e-7
     again = import_checkpoint(path, **given(tmp_path, hparams=tmp_path / "hparams.json", epsilon="1e-6"))
     assert again.audio_encoder.epsilon == 1e-6
+    (tmp_path / "hparams.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(FaceDiffError, match="hparams"):
+        import_checkpoint(path, **given(tmp_path, hparams=tmp_path / "hparams.json"))
 
 
 def test_new_and_old_names_of_weight_norm_are_the_same(tmp_path: Path) -> None:

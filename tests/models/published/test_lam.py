@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facediff.errors import FaceDiffError
 from facediff.models import LamAudio2Expression, import_checkpoint
 from facediff.models.published.lam import CONTEXT_FRAMES
 from facediff.spaces.layouts import layout
@@ -121,21 +119,6 @@ def test_the_published_stream(context: bool, tmp_path: Path) -> None:
     model.frame_rate = 25.0  # chunks fill the speech at other rates too
     parts = list(model.stream_chunks(model.clip_of(speech, "1", None), 16_000, context=context))
     assert [len(part) for part in parts] == [25, 25, 13]
-
-
-def test_hyperparameters_come_from_one_file(tmp_path: Path) -> None:
-    reference, path = author(tmp_path, 0)
-    file = tmp_path / "hparams.json"
-    file.write_text(json.dumps({"encoder_config": TEXT, "do_normalize": True, "fps": 30}), encoding="utf-8")
-    model = import_checkpoint(path, hparams=file)
-    assert model.audio_encoder.do_normalize
-    speech = speech_of(8000)
-    level = (speech - speech.mean()) / (speech.var(correction=0) + 1e-7).sqrt()
-    values = model.animate(speech, identity="2").vertices[..., 0]
-    torch.testing.assert_close(values, reference(level, 2), rtol=0, atol=1e-5)
-    file.write_text("[]", encoding="utf-8")
-    with pytest.raises(FaceDiffError, match="hparams"):
-        import_checkpoint(path, hparams=file)
 
 
 def test_channels_of_a_range_are_bounded_and_rotations_are_not() -> None:

@@ -1,4 +1,4 @@
-"""The published methods in parameters, trained on them: what they learn of speech, resumed runs, processes, 16 bits."""
+"""The published methods in parameters, trained on them: what they learn of speech, and resumed runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from facediff.models import AnimationModel
 from tests.callbacks.test_checkpoints import Stop, fit, last
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.models.published.conftest import METHODS
-from tests.models.published.test_services import DROPPING, train_together
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Checkpoint directory", "ignore:.*ThroughputMonitor")]
 
@@ -89,10 +88,3 @@ def test_a_stopped_run_continues_exactly(name: str, channels_root: Path, tmp_pat
     again, continued = fit(tmp_path / "stopped", channels_root, make, ckpt_path=start, data_class=TinyChannels)
     assert continued == curve
     assert all(torch.equal(mine, again.state_dict()[key]) for key, mine in model.state_dict().items())
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", IN_PARAMETERS)
-def test_two_processes_train_one_model_in_16_bits(name: str, channels_root: Path, tmp_path: Path) -> None:
-    data = TinyChannels(root=str(channels_root), batch_size=2)
-    train_together(made(name, **DROPPING), data, tmp_path, precision="bf16-mixed")

@@ -15,26 +15,18 @@ from tests.fakes.published import IDENTITIES, VERTICES
 from tests.models.published.author import face, imported, sample_of, speech_of
 
 
-@pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 40), ("vocaset", 41), ("biwi", 40), ("biwi", 41)])
+# As published in floating point: 205 steps are 122 frames, not 123.
+@pytest.mark.parametrize(("dataset", "steps"), [("vocaset", 41), ("vocaset", 205), ("biwi", 41), ("biwi", 58)])
 def test_it_gives_what_the_formulas_give(dataset: str, steps: int, tmp_path: Path) -> None:
     state = published.talkingstyle_state(dataset)
     model = imported(state, tmp_path, dataset)
     assert isinstance(model, TalkingStyle)
     assert len(model.network.decoder.layers) == 3
     speech = speech_of(steps)
-    for number, name in enumerate(IDENTITIES):
+    for number, name in enumerate(IDENTITIES[: 1 if steps > 50 else 3]):
         made = model.animate(speech, identity="A", condition=name).vertices.flatten(1)
         expected = published.talkingstyle_offsets(state, speech, dataset, number) + face("A")
         torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize(("dataset", "steps", "frames"), [("vocaset", 205, 122), ("biwi", 58, 29)])
-def test_frames_are_counted_in_floating_point(dataset: str, steps: int, frames: int, tmp_path: Path) -> None:
-    state = published.talkingstyle_state(dataset)
-    made = imported(state, tmp_path, dataset).animate(speech_of(steps), identity="C").vertices.flatten(1)
-    expected = published.talkingstyle_offsets(state, speech_of(steps), dataset, 2) + face("C")
-    assert len(made) == frames
-    torch.testing.assert_close(made, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("mouth", ["flattened", "vertices"])
