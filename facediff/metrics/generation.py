@@ -21,7 +21,6 @@ from facediff.metrics.base import (
     SequenceOptions,
     SumsMetric,
     check_option,
-    check_range,
     functional,
 )
 from facediff.metrics.one_pass import ErrorOf, one_pass
@@ -170,6 +169,10 @@ class DifferenceRatio(RootRatioMetric):
 difference_ratio = functional(DifferenceRatio)
 
 
+OCTAVES = 5
+"""Of a spectrum distance."""
+
+
 @metric.register("spectrum_distance")
 class SpectrumDistance(SumsMetric):
     r"""Spectrum distance: by how many decibels the power of a region's motion is off, mean over octaves.
@@ -181,9 +184,6 @@ class SpectrumDistance(SumsMetric):
     is as quick and as slow as the truth, whenever it happens. Powers below a millionth of the truth's total count as
     that much, so that a still face has a finite score.
 
-    Args:
-        octaves: how many there are.
-
     >>> import torch
     >>> truth = torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(0))
     >>> round(spectrum_distance(0.1 * truth, truth).item(), 6)
@@ -193,15 +193,10 @@ class SpectrumDistance(SumsMetric):
     divides_by = "the truth does not move in any sequence"
     in_order = True
 
-    def __init__(
-        self, region: RegionLike | None = None, *, octaves: int = 5, **options: Unpack[SequenceOptions]
-    ) -> None:
-        check_range("octaves", octaves, 1)
-        definition = (
-            f"mean over {octaves} octaves of the decibels by which the power over time is off, over {{region}} [dB]"
-        )
-        super().__init__(shape=(2, octaves), definition=definition, region=region, **options)
-        self.octaves = octaves
+    words = f"mean over {OCTAVES} octaves of the decibels by which the power over time is off, over {{region}} [dB]"
+
+    def __init__(self, region: RegionLike | None = None, **options: Unpack[SequenceOptions]) -> None:
+        super().__init__(shape=(2, OCTAVES), region=region, **options)
 
     def clip_sums(self, clip: Clip) -> Tensor:
         """Power of prediction and truth in each octave, the quickest first, of one sequence (2, octaves), float64."""
@@ -215,9 +210,9 @@ class SpectrumDistance(SumsMetric):
             power = transformed.abs().square().sum(1) / window.square().sum()
             # Frequencies as shares of Nyquist's; the octave k holds those in (2^-(k+1), 2^-k].
             share = 2 * torch.fft.fftfreq(frames, dtype=torch.float64, device=motion.device).abs()
-            octave = (-share.clamp_min(1e-9).log2()).floor().clamp_max(self.octaves - 1).long()
+            octave = (-share.clamp_min(1e-9).log2()).floor().clamp_max(OCTAVES - 1).long()
             power[0] = 0.0  # what windowing leaves of the mean
-            powers.append(power.new_zeros(self.octaves).index_add(0, octave, power))
+            powers.append(power.new_zeros(OCTAVES).index_add(0, octave, power))
         return torch.stack(powers)
 
     def score(self, sums: Tensor) -> Tensor:

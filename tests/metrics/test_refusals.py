@@ -101,7 +101,6 @@ def test_misfits_are_refused_and_nothing_is_added(kind: str, change: dict[str, A
         partial(fm.ClipSpeechLipCorrelation, [0], sample_rate=16000),
         partial(fm.SampleDiversity, n_samples=5),
         partial(fm.EnergyScore, n_samples=1),
-        partial(fm.SpectrumDistance, octaves=0),
         partial(fm.VertexError, scale=0.0),
         partial(fm.VertexError, scale=NAN),
         partial(fm.VertexError, root=True),

@@ -76,6 +76,7 @@ class ARTalk(ParametricModel):
 
     encodes_whole_clips: ClassVar[bool] = False  # but chunks that are cut anew in each step
     jaw_opens: ClassVar[bool] = False
+    clock_rule = "up"  # as many frames as the speech touches
     published_encoder: ClassVar[AudioEncoderFactory] = partial(
         Wav2Vec2Encoder, source="facebook/wav2vec2-xls-r-300m", edges=False
     )
@@ -253,10 +254,6 @@ class ARTalk(ParametricModel):
         return torch.cat([resized(hidden, scale, "area") for scale in self.scales], 1)[0]
 
     # Generation.
-
-    def frames_of(self, samples: int) -> int:
-        """As many as the speech touches."""
-        return math.ceil(samples / SAMPLE_RATE * self.frame_rate)
 
     def generate_frames(
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None

@@ -130,13 +130,10 @@ class BitCodec(nn.Module):
         """Bits of a chunk by itself."""
         return self.quantise(self.encode(motion))[1]
 
-    def values(self, bits: Bits) -> Float[Tensor, "batch tokens code_dim"]:
-        """±1/√code_dim."""
-        return (2.0 * bits - 1.0) / math.sqrt(self.code_dim)
-
     def sums(self, bits: Bits) -> list[Float[Tensor, "batch frames code_dim"]]:
         """Codes of the bits of the first rate, of the first two, and so on as far as there are bits."""
-        values, start, total, result = self.values(bits), 0, torch.zeros((), device=bits.device), []
+        values = (2.0 * bits - 1.0) / math.sqrt(self.code_dim)
+        start, total, result = 0, torch.zeros((), device=bits.device), []
         for scale in self.scales:
             if start >= bits.shape[1]:
                 break

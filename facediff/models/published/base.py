@@ -277,6 +277,8 @@ class DirectModel(PublishedModel):
     """
 
     step_rule: ClassVar[StepRule] = "features"
+    speech_steps: int = 1
+    """Steps that the audio encoder is asked for, for each frame."""
 
     def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames *width"]:
         """Speech features of each frame."""
@@ -308,11 +310,6 @@ class DirectModel(PublishedModel):
         """All frames in one pass; nothing is random."""
         motion = self.decode(self.encode_speech(batch, frames), self.identity_weights(batch), frames)
         return self.offsets_of(motion)
-
-    @property
-    def speech_steps(self) -> int:
-        """Steps that the audio encoder is asked for, for each frame."""
-        return 1
 
     def graphs(self) -> Graphs:
         """Speech to features, features to motion."""

@@ -156,10 +156,6 @@ class CodeTalker(AutoregressiveModel):
         deaf = {"audio_encoder": NoSpeech, "audio_dim": 1} if self.stage == "prior" else {}
         super().keep_hyperparameters({**arguments, **deaf, "prior": None})
 
-    def personal_modules(self) -> list[nn.Module]:
-        """The predictor's table of speakers; a prior knows none."""
-        return [] if self.stage == "prior" else [self.network.style]
-
     # The prior of a predictor.
 
     @property

@@ -199,12 +199,6 @@ class DiffPoseTalk(ParametricModel):
         style: Tensor = self.style_encoder(motion, mask[:, : self.window_frames])
         return style
 
-    def given_style(self, batch: Batch) -> Float[Tensor, "batch style_dim"] | None:
-        """The batch's styles; None where it has none."""
-        if isinstance(batch.style, Tensor) and not batch.style.shape[1]:
-            return None
-        return self.style_of(batch)
-
     # Training.
 
     def losses(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
@@ -315,7 +309,8 @@ class DiffPoseTalk(ParametricModel):
         self, batch: Batch, frames: Int[Tensor, " batch"], *, seeds: Sequence[int], progress: Progress | None = None
     ) -> BatchMotion:
         """Windows one after the other; a clip's noise depends on its seed alone."""
-        style, shapes = self.given_style(batch), self.shapes_of(batch)
+        unstyled = isinstance(batch.style, Tensor) and not batch.style.shape[1]
+        style, shapes = None if unstyled else self.style_of(batch), self.shapes_of(batch)
         rows = []
         for i, seed in enumerate(seeds):
             audio = batch.audio[i, : int(batch.audio_lengths[i])]

@@ -33,7 +33,6 @@ from facediff.models.published.diffusion import DiffusionModel, diffusion_graphs
 from facediff.models.published.positions import distance_bias, periodic_positions
 from facediff.models.samplers import NoiseProcess, NoiseSource, Sampler
 from facediff.models.squared_errors import squared_errors
-from facediff.speech.windows import FrameClock
 from facediff.utils.ranges import Range
 
 Scheduler = Literal["published", "ddim"]
@@ -128,11 +127,6 @@ class DiffSpeaker(DiffusionModel):
         _ = self.sampler  # refuses a number of steps that the process has not
 
     # Frames, speech and the speaker.
-
-    @property
-    def clock(self) -> FrameClock:
-        """By the steps of the speech network, at any frame rate."""
-        return FrameClock(self.frame_rate, "steps", self.audio_encoder.convolutions())
 
     def tested_frames(self, batch: Batch) -> list[int]:
         """As many as the truth has, as in the published test."""

@@ -18,7 +18,7 @@ from facediff.models.inference import Style
 from facediff.models.layers import Heads, Layers, Width, check_heads
 from facediff.models.published.base import NO_STYLE, PublishedModel
 from facediff.models.published.clip_style import TABLE_ROWS, ClipStyleEncoder
-from facediff.speech.windows import FrameClock
+from facediff.speech.windows import Rule
 from facediff.utils.ranges import Range
 
 DEAD = 0.01
@@ -49,6 +49,7 @@ class ParametricModel(PublishedModel):
 
     interpolates: ClassVar[bool] = True
     jaw_opens: ClassVar[bool] = True
+    clock_rule: ClassVar[Rule | None] = "rounded"
     style_encoder: ClipStyleEncoder
 
     motion_mean: Tensor
@@ -106,11 +107,6 @@ class ParametricModel(PublishedModel):
         self.motion_mean.copy_(mean)
         self.motion_std.copy_(deviation.clamp_min(DEAD * float(deviation.max())))
         return result
-
-    @property
-    def clock(self) -> FrameClock:
-        """Whole frames of the speech."""
-        return FrameClock(self.frame_rate)
 
     def own_styles(self) -> dict[str, Style]:
         """None: the methods take a style from a clip, and know no table of speakers."""

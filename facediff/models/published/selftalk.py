@@ -113,12 +113,13 @@ class SelfTalk(DirectModel):
     ) -> None:
         super().__init__(unseen_identity=unseen_identity, **options)
         self.windows = type(self.windows)(above=math.inf)  # the decoder has no table of positions
+        self.speech_steps = 2 if self.pairs else 1
         dim = dim or (1024 if self.pairs else 512)
         check_heads(dim=dim, num_heads=num_heads)
         self.vertex_weight, self.velocity_weight = vertex_weight, velocity_weight
         self.consistency_weight, self.ctc_weight = consistency_weight, ctc_weight
         self.network = SelfTalkNetwork(
-            audio_width=self.audio_width * (2 if self.pairs else 1),
+            audio_width=self.audio_width * self.speech_steps,
             coordinates=self.coordinates,
             dim=dim,
             num_layers=num_layers,
@@ -176,11 +177,6 @@ class SelfTalk(DirectModel):
         """A lip reader of these vertices, with the recogniser's width and letters."""
         return LipReader(vertices, self.dims, dim=text.width, letters=text.letters, **self._reader_options)
 
-    @property
-    def speech_steps(self) -> int:
-        """Two where speech comes in pairs."""
-        return 2 if self.pairs else 1
-
     def encode_speech(self, speech: SpeechInput, frames: Int[Tensor, " batch"]) -> Float[Tensor, "batch frames width"]:
         """Speech features of each frame; where speech comes in pairs, two hidden states side by side."""
         rule: StepRule = "hidden_cut" if self.pairs else "features"
@@ -216,11 +212,6 @@ class SelfTalk(DirectModel):
         motion: Tensor = self.network(features, frames)
         return motion
 
-    def lip_steps_of(self, frames: int) -> int:
-        """Steps at 50 a second for which the lip reader reads so many frames."""
-        # In floating point as published: 69 frames at 30 a second are 114 steps, not 115.
-        return max(1, int(frames / self.frame_rate * 50))
-
     @torch.no_grad()
     def read_lips(
         self, motion: BatchMotion, frames: Int[Tensor, " batch"] | None = None
@@ -236,7 +227,9 @@ class SelfTalk(DirectModel):
             )
         if frames is None:
             frames = torch.full((len(motion),), motion.shape[1], device=motion.device)
-        steps = torch.tensor([self.lip_steps_of(count) for count in frames.tolist()], device=motion.device)
+        # In floating point as published: 69 frames at 30 a second are 114 steps, not 115.
+        counts = [max(1, int(count / self.frame_rate * 50)) for count in frames.tolist()]
+        steps = torch.tensor(counts, device=motion.device)
         letters: Tensor = self.reader((motion * self.scale).flatten(2), frames, steps).letters
         return letters
 

@@ -80,7 +80,7 @@ class Voca(DirectModel):
         self.windows = type(self.windows)(above=math.inf)
         self.speech_window, self.velocity_weight, self.shapes = speech_window, velocity_weight, shapes
         # Rows of speech from one frame to the next, as close to the published 60 a second as whole numbers come.
-        self.rows_per_frame = max(1, round(PUBLISHED_RATE / self.frame_rate))
+        self.speech_steps = max(1, round(PUBLISHED_RATE / self.frame_rate))
         self.network = VocaNetwork(
             audio_width=self.audio_width,
             coordinates=self.coordinates,
@@ -148,23 +148,18 @@ class Voca(DirectModel):
     @property
     def clock(self) -> FrameClock:
         """At the published 60 frames a second, as many as rows; else every so many of them, from the first on."""
-        return FrameClock(self.frame_rate, "rows", rows=self.rows_per_frame)
+        return FrameClock(self.frame_rate, "rows", rows=self.speech_steps)
 
     def trained_frames(self, batch: Batch) -> Int[Tensor, " batch"]:
         """Frames of each clip for which there is speech."""
         counts = torch.tensor([self.frames_of(int(n)) for n in batch.audio_lengths], device=batch.frame_lengths.device)
         return torch.minimum(batch.frame_lengths, counts.clamp_min(1))
 
-    @property
-    def speech_steps(self) -> int:
-        """Rows of speech from one frame to the next."""
-        return self.rows_per_frame
-
     def encode_speech(
         self, speech: SpeechInput, frames: Int[Tensor, " batch"]
     ) -> Float[Tensor, "batch frames channels rows"]:
         """The window of speech around each frame; what lies before or after the speech is zero."""
-        step, rows = self.rows_per_frame, self.row_counts(speech.audio_lengths)
+        step, rows = self.speech_steps, self.row_counts(speech.audio_lengths)
         cached = speech.cached_features or ()
         features = self.audio_encoder.at_rate(speech.audio, speech.audio_lengths, rows, self.frame_rate * step, *cached)
         # Zeros of logits past the ends, as published, and not the logits of silence.
@@ -177,7 +172,7 @@ class Voca(DirectModel):
     def row_counts(self, samples: Int[Tensor, " batch"]) -> Int[Tensor, " batch"]:
         """Rows of speech of clips, at least one."""
         if exporting():  # the clock's rule in the same floating point, without leaving the graph
-            rate = self.frame_rate * self.rows_per_frame
+            rate = self.frame_rate * self.speech_steps
             return (samples.double() / SAMPLE_RATE * rate).round().long().clamp_min(1)
         counts = [max(1, self.clock.row_count(count)) for count in samples.tolist()]
         return torch.tensor(counts, device=samples.device)

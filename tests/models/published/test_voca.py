@@ -120,7 +120,7 @@ def test_the_command_and_its_checkpoint(
     ]
     assert main([*words, "--templates", "faces.pkl", "-o", "voca.ckpt"]) == 0
     printed = "".join(capsys.readouterr())
-    for expected in ("60 frames", "global_step", "MPL-2.0", "forbidden"):
+    for expected in ("60 frames", "of the optimiser", "MPL-2.0", "forbidden"):
         assert expected in printed
     for name in ("deepspeech.npz", "voca.npz"):
         (tmp_path / name).unlink()
