@@ -68,11 +68,11 @@ def vertices_of(shape: tuple[int, ...]) -> int | None:
 
 
 def read_arrays(
-    path: Path, keys: Container[str] | None = None, *, name: str = "", remedy: str = "write it again"
+    path: Path, keys: Container[str] | None = None, *, remedy: str = "write it again"
 ) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of a ``.npz`` file by name: of ``keys``, or all; messages call it ``name`` and end in ``remedy``."""
+    """The arrays of a ``.npz`` file by name: of ``keys``, or all; messages end in ``remedy``."""
     # zipfile, zlib and NumPy each have several exceptions for damaged files.
-    with damaged(f"{name or path}: not a readable .npz file", remedy, Exception), _PARSING, warnings.catch_warnings():
+    with damaged(f"{path}: not a readable .npz file", remedy, Exception), _PARSING, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy's advice on headers that Python 2 wrote
         # Opened here, since NumPy leaves a damaged archive open.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
