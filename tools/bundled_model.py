@@ -1,13 +1,13 @@
 r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
-The recipe, where flite is installed, in an hour and a quarter on two cores. READERS
+The recipe, where flite is installed, in two hours and a half on two cores. READERS
 are 121 people of LibriSpeech with up to two recordings each.
 
     $ facediff data align LibriSpeech -o READERS
     $ FIT="facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
         --model.motion_space.eyelids_weight=20 --trainer.callbacks+=facediff.callbacks.SpokenSoundsTerm \
         --trainer.callbacks.recordings=READERS"
-    $ $FIT && $FIT --ckpt_path last --trainer.max_epochs=16 --data.augmented_share=0.25
+    $ $FIT && for EPOCHS in 16 32; do $FIT --ckpt_path last --trainer.max_epochs=$EPOCHS --data.augmented_share=0.25; done
     $ cp runs/puppet_quality/version_0/checkpoints/last.ckpt puppet.ckpt
     $ facediff generation-metrics puppet.ckpt --samples 3 --references 1 --max-clips 30 --json puppet.json
     $ python tools/bundled_model.py puppet.ckpt
