@@ -111,5 +111,5 @@ def test_defaults_of_corpora(name: str) -> None:
     own = defaults(registry.corpus.get(name))
     promised = {"window": None, "windows_per_clip": 1, "reference": "same_subject", "reference_frames": 100}
     promised |= {"batch_size": 8 if name.startswith("Puppet") else 1, "augmented_share": 1.0}
-    promised |= {"Mead3D": {"split": "sentence"}, "BEAT": {"split": "order"}}.get(name, {})
+    promised |= {"Mead3D": {"split": "sentence"}}.get(name, {})
     assert {option: own[option] for option in promised} == promised
