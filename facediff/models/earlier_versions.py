@@ -30,6 +30,7 @@ REMOVED: dict[str, dict[str, Any]] = {
     "facediff.models.mesh_encoders.SpiralMeshEncoder": {"negative_slope": 0.2, "max_frames": None},
     "facediff.models.speaker_encoders.HierarchicalIdentity": {"unseen": "mean"},
     "facediff.data.puppet.Puppet": {"edition": (None, 2)},
+    "facediff.data.parametric.Beat": {"split": "order"},
     "facediff.models.published.faceformer.FaceFormer": {"loop": ANY, "alignment": "auto"},
     "facediff.models.published.talkingstyle.TalkingStyle": {
         **{"loop": ANY, "alignment": "auto", "mouth_weight": 0.6, "style_attention": "one_key"},
@@ -73,7 +74,12 @@ REMOVED: dict[str, dict[str, Any]] = {
 """By class path, the removed options and the value that each has for good, as plain data of a checkpoint; a tuple
 holds several such values, a function makes them of the other options."""
 
-SHORT_NAMES = {"mel": "MelEncoder", "spiral": "SpiralMeshEncoder", "hierarchical": "HierarchicalIdentity"}
+SHORT_NAMES = {
+    "mel": "MelEncoder",
+    "spiral": "SpiralMeshEncoder",
+    "hierarchical": "HierarchicalIdentity",
+    "BEAT": "Beat",
+}
 """Registered names of components of :data:`REMOVED`, by which configs and checkpoints name them, and their classes."""
 
 
