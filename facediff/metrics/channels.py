@@ -379,7 +379,6 @@ class ShannonIndex(ChannelMetric):
 
     Args:
         clusters: k.
-        seed: of k-means.
         of: ``"prediction"`` or ``"truth"``, the side of the counted labels.
 
     >>> import torch
@@ -397,19 +396,17 @@ class ShannonIndex(ChannelMetric):
         region: RegionLike | None = None,
         *,
         clusters: int = 40,
-        seed: int = 0,
         of: Literal["prediction", "truth"] = "prediction",
         **options: Unpack[SequenceOptions],
     ) -> None:
         check_option("of", of, Literal["prediction", "truth"])
         check_range("clusters", clusters, 1)
         definition = (
-            f"entropy of the shares of {clusters} clusters of the truth's frames (k-means, seed {seed}) among the "
+            f"entropy of the shares of {clusters} clusters of the truth's frames (k-means, seed 0) among the "
             f"frames {SIDE_WORDS[of]}, over {{region}}, all sequences together [bit]"
         )
         super().__init__(region, definition=definition, **options)
         self.clusters = clusters
-        self.seed = seed
         self.of = of
         # Flat, and never an empty list: torchmetrics gathers a process without data as one flat float32 tensor.
         self.add_state("predicted", [], dist_reduce_fx="cat")
@@ -454,7 +451,7 @@ class ShannonIndex(ChannelMetric):
             (torch.cat(state) if isinstance(state, list) else state).view(-1, int(self.width)).cpu()
             for state in (self.predicted, self.true)
         )
-        centres = cluster_centres(true, self.clusters, self.seed)
+        centres = cluster_centres(true, self.clusters, seed=0)
         labels = nearest_centres(predicted if self.of == "prediction" else true, centres)
         shares = labels.bincount(minlength=len(centres)).double() / len(labels)
         return -torch.special.xlogy(shares, shares).sum() / torch.log(torch.tensor(2.0, dtype=torch.float64)) + 0.0

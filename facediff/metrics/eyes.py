@@ -111,10 +111,6 @@ class BlinkRateRatio(BlinkMetric):
 blink_rate_ratio = functional(BlinkRateRatio)
 
 
-Blinker = Literal["prediction", "truth"]
-"""The motion in which blinks are counted."""
-
-
 @metric.register("blink_rate")
 class BlinkRate(BlinkMetric):
     """Blink rate: blinks a minute, over all sequences. People who talk blink about 15 to 20 times.
@@ -138,18 +134,18 @@ class BlinkRate(BlinkMetric):
         pairs: LipPairsLike,
         *,
         frames_per_second: float | None = None,
-        of: Blinker = "prediction",
+        of: Literal["prediction", "truth"] = "prediction",
         closed: float = CLOSED,
         reopened: float = REOPENED,
         **options: Unpack[SequenceOptions],
     ) -> None:
-        check_option("of", of, Blinker)
+        check_option("of", of, Literal["prediction", "truth"])
         frames_per_second = frames_per_second or 0.0
         check_range("frames_per_second", frames_per_second, 1e-9)
         definition = f"blinks of the {of} over minutes at {frames_per_second:g} frames a second"
         super().__init__(pairs, definition=definition, closed=closed, reopened=reopened, **options)
         self.frames_per_second = frames_per_second
-        self.of: Blinker = of
+        self.of = of
 
     def clip_parts(self, clip: Clip) -> tuple[Tensor, Tensor]:
         """Blinks of one side of one sequence, and how many minutes it lasts."""

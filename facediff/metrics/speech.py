@@ -15,7 +15,6 @@ from torch import Tensor
 from facediff.metrics.base import (
     SIDE_WORDS,
     Clip,
-    Clips,
     Coverage,
     Inferred,
     SequenceOptions,
@@ -149,17 +148,9 @@ class ClipSpeechLipCorrelation(SumsMetric):
         it: the intensity of each frame, (batch, frames) or (frames,). ``identities`` has the number of each sequence's
         identity, below ``n_identities``; needed unless there is one.
         """
-        clips = self.align(prediction, truth, **batch)
-        clips = self.attach_speech(clips, waveform, intensity, single=truth.ndim == 3)
-        count = len(clips.clips)
-        if identities is None:
-            identities = [0] * count if self.n_identities == 1 else []
-        self.add(clips.attach("identity", whole_numbers("identities", identities, count, self.n_identities - 1)))
-
-    def attach_speech(self, clips: Clips, waveform: Tensor | None, intensity: Tensor | None, *, single: bool) -> Clips:
-        """The sequences with the intensity of their speech; ``single`` for one sequence without batch axis."""
         if waveform is not None and (intensity is not None or self.sample_rate is None):
             raise ValueError("give intensity=, or waveform= to a metric made with sample_rate= and frames_per_second=")
+        clips, single = self.align(prediction, truth, **batch), truth.ndim == 3
         if waveform is not None:
             rows = clips.rows("waveform", waveform, single=single, ndim=2)
             rates = int(self.sample_rate or 0), float(self.frames_per_second or 0)
@@ -169,7 +160,11 @@ class ClipSpeechLipCorrelation(SumsMetric):
             speech = [row[: clip.frames].double() for clip, row in zip(clips.clips, rows, strict=True)]
             if any(len(frames) < clip.frames for clip, frames in zip(clips.clips, speech, strict=True)):
                 raise ValueError("an intensity has fewer frames than its motion; cut the motion, or fill up with zeros")
-        return clips.attach("speech", [row.to(self.counts.device) for row in clips.finite("speech", speech)])
+        clips = clips.attach("speech", [row.to(self.counts.device) for row in clips.finite("speech", speech)])
+        count = len(clips.clips)
+        if identities is None:
+            identities = [0] * count if self.n_identities == 1 else []
+        self.add(clips.attach("identity", whole_numbers("identities", identities, count, self.n_identities - 1)))
 
     def clip_value(self, clip: Clip) -> Tensor:
         """NaN for a clip of one frame, which has no motion."""

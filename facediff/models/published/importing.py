@@ -334,8 +334,6 @@ def save_model(model: AnimationModel, path: Path) -> None:
             accelerator="cpu",
             logger=False,
             enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
         )
     finally:
         announcements.setLevel(level)

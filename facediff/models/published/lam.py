@@ -162,11 +162,10 @@ class LamNetwork(nn.Module):
         )
         self.decoder = ConvolutionStack(dim, dim, residual=False)
         self.motion_out = nn.Linear(dim, coordinates)
-        low, high = space.valid_range or (0.0, 1.0)
+        self.low, self.high = space.valid_range or (0.0, 1.0)
         bounded = torch.zeros(coordinates, dtype=torch.bool)
         if space.valid_range is not None:
             bounded[list(space.face)] = True
-        self.low, self.high = low, high
         self.register_buffer("bounded", bounded, persistent=False)
 
     bounded: Bool[Tensor, " coordinates"]

@@ -123,13 +123,10 @@ def test_animation_is_parameters_of_flame(tmp_path: Path) -> None:
         vector = model.encode_style(clip.motion[None], torch.ones(1, 30, dtype=torch.bool))[0]
     by_vector = model.animate(wave, identity="A", style=Style("v", vector), seed=3).vertices
     assert by_clip.shape == (45, 56, 1)
+    assert not model.has_sampler("dpm_solver")
     assert torch.equal(by_clip, again)
     torch.testing.assert_close(by_vector, by_clip, rtol=1e-3, atol=1e-4)
     assert not torch.allclose(plain, by_clip)
-
-
-def test_no_registered_sampler_is_taken(tmp_path: Path) -> None:
-    assert not imported(tmp_path).has_sampler("dpm_solver")
 
 
 @pytest.mark.parametrize(
