@@ -293,6 +293,7 @@ class ExportOptions(CheckedOptions):
             written, and to .glb materials and pictures too (default: the target mesh)
         view: for videos: camera
         size: for videos: height and width in pixels; a .gif has a third of it
+        video_rate: for videos: pictures a second, with motion interpolated between frames (default: its frame rate)
         footer: text below a video, such as "synthetic corpus"
         quiet: whether progress bars are hidden
         speech_file: name of the .wav file that is written next to the animation; None if there is none. Set by
@@ -309,6 +310,7 @@ class ExportOptions(CheckedOptions):
     surface: Annotated[FilePath | None, Option(metavar="MESH", reads=True)] = None
     view: View = "front"
     size: Annotated[ranges.Pixels, Option(metavar="PIXELS")] = 1080
+    video_rate: Annotated[ranges.FrameRate | None, Option(metavar="F")] = None
     footer: Annotated[str, Option(hidden=True)] = ""
     quiet: Annotated[bool, Option(hidden=True)] = True
     speech_file: Annotated[str | None, Option(hidden=True)] = None
@@ -505,3 +507,4 @@ class ExportKeywords(TypedDict, total=False):
     surface: FilePath | None
     view: View
     size: int
+    video_rate: float | None

@@ -69,8 +69,8 @@ class Format(ABC):
     up_axes: ClassVar[tuple[Up, ...]] = ("y", "z")
     """Axes that may point up."""
     uses: ClassVar[tuple[str, ...]] = ()
-    """Which of the options ``view``, ``size``, ``tolerance``, ``shapes``, ``tracks``, ``key_tolerance`` and ``surface``
-    it uses; the command line refuses others."""
+    """Which of the options ``view``, ``size``, ``video_rate``, ``tolerance``, ``shapes``, ``tracks``, ``key_tolerance``
+    and ``surface`` it uses; the command line refuses others."""
     requires: ClassVar[tuple[str, str] | None] = None
     """An optional package that writing needs: its import name, and the extra of facediff that installs it."""
 

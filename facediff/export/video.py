@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +31,7 @@ class Mp4(Format):
     speech: ClassVar[Literal["in the file", "next to it", "none"]] = "in the file"
     units = "none"
     up_axes = ()
-    uses = ("view", "size")
+    uses = ("view", "size", "video_rate")
     requires = ("av", "render")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
@@ -43,7 +44,7 @@ class Mp4(Format):
         frames = shown_frames(path, animations, options)
         speaking = next((animation for animation in animations if animation.speech is not None), animations[0])
         sound = speaking.sound() if not options.no_speech else None
-        write_video(path, frames, speaking.frame_rate, sound, speaking.sample_rate)
+        write_video(path, frames, options.video_rate or speaking.frame_rate, sound, speaking.sample_rate)
 
 
 @export_format.register("webm")
@@ -62,7 +63,7 @@ class Gif(Mp4):
         """Write a picture that plays again and again; its frames last whole hundredths of a second."""
         from PIL import Image
 
-        rate = animations[0].frame_rate
+        rate = options.video_rate or animations[0].frame_rate
         frames = shown_frames(path, animations, replace(options, size=max(options.size // 3, 16)))
         pictures = [Image.fromarray(frame).quantize(dither=Image.Dither.NONE) for frame in frames]
         # Rounded ends, not rounded lengths, keep the pace.
@@ -74,8 +75,30 @@ class Gif(Mp4):
 def shown_frames(path: Path, animations: Sequence[Animation], options: ExportOptions) -> Iterator[Frame]:
     """The pictures of a file, with a progress bar."""
     longest = max(len(animation.vertices) for animation in animations)
+    total = longest if options.video_rate is None else _count(longest, animations[0].frame_rate, options.video_rate)
     frames = drawn_frames(animations, options)
-    return iter(track(frames, f"drawing {path.name}", total=longest, shown=not options.quiet))
+    return iter(track(frames, f"drawing {path.name}", total=total, shown=not options.quiet))
+
+
+def _count(frames: int, frame_rate: float, video_rate: float) -> int:
+    return math.floor((frames - 1) * video_rate / frame_rate + 1e-9) + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolated:
+    """Motion (T, V, 3) at another rate: a picture between two frames shows the straight way between them."""
+
+    motion: npt.NDArray[np.floating]
+    frame_rate: float
+    video_rate: float
+
+    def __len__(self) -> int:
+        return _count(len(self.motion), self.frame_rate, self.video_rate)
+
+    def __getitem__(self, index: int) -> npt.NDArray[np.floating]:
+        part, frame = math.modf(index * self.frame_rate / self.video_rate)
+        before = np.asarray(self.motion[int(frame)])
+        return before if part < 1e-6 else before + np.float32(part) * (self.motion[int(frame) + 1] - before)
 
 
 def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Iterator[Frame]:
@@ -107,10 +130,12 @@ def drawn_frames(animations: Sequence[Animation], options: ExportOptions) -> Ite
         for animation in animations
     ]
     frames = max(len(animation.vertices) for animation in animations)
-    motions = [
+    motions: list[Any] = [
         np.pad(motion, ((0, frames - len(motion)), (0, 0), (0, 0)), "edge") if len(motion) < frames else motion
         for motion in (animation.vertices for animation in animations)
     ]
+    if options.video_rate is not None:
+        motions = [Interpolated(motion, animations[0].frame_rate, options.video_rate) for motion in motions]
     # A video must say that a corpus is synthetic, so that the footer names the corpora unless the user chose a text.
     corpora = dict.fromkeys(animation.metadata["corpus"] for animation in animations if "corpus" in animation.metadata)
     footer = " - ".join(part for part in (options.footer or ", ".join(corpora), procedural(animations)) if part)

@@ -17,7 +17,7 @@ from facediff.export.sequences import RECORD
 from facediff.mesh.textures import has_textures
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
-OPTIONS = ("view", "size", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
+OPTIONS = ("view", "size", "video_rate", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
 """Options that some formats use."""
 
 

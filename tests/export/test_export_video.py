@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 
 from facediff.animation import Animation
 from facediff.export import ExportOptions, video, write_animations
-from facediff.export.video import drawn_frames
+from facediff.export.video import Interpolated, drawn_frames
 
 SMALL = ExportOptions(size=64)
 
@@ -47,6 +47,18 @@ def test_a_video_for_web_pages_has_speech_and_a_moving_picture_has_none(animatio
         lengths = [frame.info["duration"] for frame in ImageSequence.Iterator(picture)]
         assert picture.width == 64
     assert sum(lengths) == pytest.approx(1000 * 40 / 30, abs=5)
+
+
+def test_a_video_may_have_more_pictures_than_frames(animation: Animation, tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.mp4", [animation], replace(SMALL, video_rate=60.0))
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].average_rate == 60
+    assert len(pictures(tmp_path / "a.mp4")) == 79
+    motion = animation.vertices
+    between = Interpolated(motion, 30.0, 60.0)
+    assert len(between) == 79
+    assert np.array_equal(between[78], motion[39])
+    assert between[7] == pytest.approx((motion[3] + motion[4]) / 2, abs=1e-7)
 
 
 def test_no_speech_is_a_silent_video(animation: Animation, tmp_path: Path) -> None:
