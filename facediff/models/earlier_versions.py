@@ -74,12 +74,7 @@ REMOVED: dict[str, dict[str, Any]] = {
 """By class path, the removed options and the value that each has for good, as plain data of a checkpoint; a tuple
 holds several such values, a function makes them of the other options."""
 
-SHORT_NAMES = {
-    "mel": "MelEncoder",
-    "spiral": "SpiralMeshEncoder",
-    "hierarchical": "HierarchicalIdentity",
-    "BEAT": "Beat",
-}
+SHORT_NAMES = {"mel": "MelEncoder", "spiral": "SpiralMeshEncoder", "hierarchical": "HierarchicalIdentity"}
 """Registered names of components of :data:`REMOVED`, by which configs and checkpoints name them, and their classes."""
 
 
