@@ -7,7 +7,8 @@ are 121 people of LibriSpeech with up to two recordings each.
     $ FIT="facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
         --model.motion_space.eyelids_weight=20 --trainer.callbacks+=facediff.callbacks.SpokenSoundsTerm \
         --trainer.callbacks.recordings=READERS"
-    $ $FIT && for EPOCHS in 16 32; do $FIT --ckpt_path last --trainer.max_epochs=$EPOCHS --data.augmented_share=0.25; done
+    $ MORE="--ckpt_path last --data.augmented_share=0.25"
+    $ $FIT && $FIT $MORE --trainer.max_epochs=16 && $FIT $MORE --trainer.max_epochs=32
     $ cp runs/puppet_quality/version_0/checkpoints/last.ckpt puppet.ckpt
     $ facediff generation-metrics puppet.ckpt --samples 3 --references 1 --max-clips 30 --json puppet.json
     $ python tools/bundled_model.py puppet.ckpt

@@ -6,7 +6,6 @@ coordinates; for parameters the points are channels, one number each. Units of l
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import asdict, dataclass, fields
@@ -165,8 +164,7 @@ class Space:
 
     def state(self) -> dict[str, Any]:
         """The record as plain containers, fit for checkpoints and JSON."""
-        record: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return record
+        return asdict(self, dict_factory=lambda pairs: {k: list(v) if isinstance(v, tuple) else v for k, v in pairs})
 
     @classmethod
     def from_state(cls, state: object) -> Space:
