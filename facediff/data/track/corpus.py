@@ -25,6 +25,7 @@ from facediff.data.track.face import (
     MILLIMETRES,
     filled,
     horizontal_gaze,
+    iris_width,
     median_face,
     pair_distances,
     pose,
@@ -54,6 +55,7 @@ METRES = 1e-3  # to a millimetre
 CLOSED = 1e-3  # metres between lips that count as closed
 CONTEXT = 32  # frames on either side of a clip that its smoothing sees
 SAMPLE = 600  # frames of a person of which the median face is made
+IRIS = 11.7  # millimetres that people's irises measure
 SMALL_FACE, SLOW, REPEATED, OPEN, NOISY_BROWS = 80, 24, 0.05, 0.9, 1.4
 """Limits of warnings: pixels, frames a second, share of pictures, share of frames, difference ratio."""
 CHANNELS = ("head_npy", "gaze_npy", "confidence_npy")
@@ -67,6 +69,7 @@ class PersonReport:
     clips: int
     seconds: float
     splits: dict[str, int]
+    iris: float  # millimetres
     neutral_gap: float  # millimetres between the lips of the neutral face
     warnings: tuple[str, ...]
 
@@ -75,8 +78,8 @@ class PersonReport:
         parts = ", ".join(f"{count} {split}" for split, count in self.splits.items())
         parts = parts if self.clips > 1 else "in no split; more video gives more clips"
         return (
-            f"{self.name}: {counted(self.clips, 'clip')} ({parts}), {self.seconds / 60:.1f} min; lips of "
-            f"the neutral face are {self.neutral_gap:.1f} mm apart"
+            f"{self.name}: {counted(self.clips, 'clip')} ({parts}), {self.seconds / 60:.1f} min; irises measure "
+            f"{self.iris:.1f} mm, lips of the neutral face are {self.neutral_gap:.1f} mm apart"
         )
 
 
@@ -194,7 +197,10 @@ def import_video(video: Path, name: str, corpus: Path, out: Path, clip_seconds: 
     facts = read_manifest(corpus)
     if facts.get("corpus") != CORPUS:
         raise FaceDiffError(f"{corpus}: is no corpus of `facediff data track`, which videos need; give meshes")
-    options = TrackingOptions(frame_rate=facts["frame_rate"], clip_seconds=clip_seconds)
+    settings = {
+        key.removeprefix("--").replace("-", "_"): value for key, value in facts["options"].items() if "--" in key
+    }
+    options = TrackingOptions(**{**settings, "clip_seconds": clip_seconds})
     report = track_people(find_videos(video, name), out, options)
     write_json(out / MANIFEST, {**read_manifest(out), "corpus": "person", "person": name})
     return report
@@ -262,13 +268,15 @@ class PeopleWriter:
         self.recordings += [recording for recording, _ in recordings]
         sample = np.concatenate([summary.sample for _, summary in recordings])
         target = median_face(sample, self.model)
+        iris = iris_width(pose(sample, target, self.model.weights).faces)
+        scale = METRES * (IRIS / iris if self.options.scale == "iris" else 1.0)
         self._remove(name)
         clips: list[WrittenClip] = []
         for recording, summary in recordings:
             for part in summary.parts:
                 for frames in self._cuts(recording, *part):
                     clip_name = f"{name}_s{len(clips) + 1:03d}"
-                    clips.append(self._write(clip_name, recording, summary, part, frames, target))
+                    clips.append(self._write(clip_name, recording, summary, part, frames, target, scale))
         for clip, split in zip(clips, splits(len(clips)), strict=True):
             clip.row["split"] = split
             self.rows[clip.row["clip"]] = clip.row
@@ -279,6 +287,7 @@ class PeopleWriter:
             clips=len(clips),
             seconds=len(gaps) / self.options.frame_rate,
             splits=dict(Counter(clip.row["split"] for clip in clips)),
+            iris=iris,
             neutral_gap=float(pair_distances(self.templates[name][None])[0]) / METRES,
             warnings=tuple(warnings(recordings, clips)),
         )
@@ -309,6 +318,7 @@ class PeopleWriter:
         part: tuple[int, int],
         frames: tuple[int, int],
         target: Array,
+        scale: float,
     ) -> WrittenClip:
         """Write a clip's motion, speech and channels."""
         first, stop = frames
@@ -318,13 +328,14 @@ class PeopleWriter:
         posed = pose(recording.landmarks[context], target, self.model.weights)
         faces = resampled(filled(posed.faces, times), times, rate)
         angles = resampled(filled(posed.angles, times), times, rate)
-        faces, angles = smooth_by_region(faces, rate, self.model.triangles), smooth_soft(angles, rate)
+        if self.options.smoothing == "region":
+            faces, angles = smooth_by_region(faces, rate, self.model.triangles), smooth_soft(angles, rate)
         grid = times[0] + np.arange(len(faces)) / rate
         inside = (grid >= recording.times[first] - 1e-6) & (grid <= recording.times[stop - 1] + 1e-6)
         faces, angles, grid = faces[inside], angles[inside], grid[inside]
         confidence = presence[np.interp(grid, times, np.arange(len(times))).round().astype(int)]
         gaze = np.stack([horizontal_gaze(faces), np.zeros(len(faces))], axis=1)
-        vertices = METRES * faces[:, :POINTS]
+        vertices = scale * faces[:, :POINTS]
         speech = recording.speech[round(grid[0] * SAMPLE_RATE) :]
         speech = fit_length(speech, samples_for(len(faces), rate))
         write_clip(self.out, clip, vertices, speech)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from facediff.errors import FaceDiffError
 from facediff.utils import ranges
@@ -30,6 +30,8 @@ class TrackingOptions:
         frame_rate: frames a second of the corpus
         face: which of several faces: largest, left, or its number from the left
         min_face: width in pixels of the smallest face
+        smoothing: of the motion, by region; or none
+        scale: size of the faces: as the model's canonical face, or so that irises measure 11.7 mm
         clip_seconds: approximate length of a clip
         licence: terms of the footage, such as CC-BY-4.0 or "consent of Maria"
         commercial: the terms allow commercial use
@@ -39,6 +41,8 @@ class TrackingOptions:
     frame_rate: Annotated[ranges.FrameRate, Option(metavar="F")] = 25.0
     face: Annotated[str | None, Option(metavar="WHICH", check=check_face)] = None
     min_face: Annotated[ranges.Pixels, Option(metavar="PIXELS")] = 50
+    smoothing: Literal["region", "none"] = "region"
+    scale: Literal["canonical", "iris"] = "canonical"
     clip_seconds: Annotated[ranges.ClipLength, Option(metavar="S")] = 8.0
     licence: Annotated[str, Option(metavar="TEXT")] = "unknown"
     commercial: bool = False
@@ -46,7 +50,8 @@ class TrackingOptions:
     @property
     def settings(self) -> dict[str, Any]:
         """What all people of a corpus have in common."""
-        return {"--frame-rate": self.frame_rate, "--clip-seconds": self.clip_seconds}
+        names = ("frame_rate", "smoothing", "scale", "clip_seconds")
+        return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
 
     @property
     def task(self) -> Path | None:

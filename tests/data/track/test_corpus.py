@@ -63,12 +63,11 @@ def test_a_video_becomes_a_sound_corpus(tmp_path: Path, capsys: pytest.CaptureFi
     assert json.loads(capsys.readouterr().out)["findings"] == []
 
 
-def test_uneven_times_give_even_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("facediff.data.track.corpus.smooth_by_region", lambda faces, *_: faces)
+def test_uneven_times_give_even_frames(tmp_path: Path) -> None:
     times = np.cumsum(np.random.default_rng(0).choice([0.033, 0.067], 200))
     gaps = 0.45 + 0.4 * np.sin(2 * np.pi * 0.8 * times)
     video = write_coded_video(tmp_path / "eva.mp4", pictures([Look(float(gap)) for gap in gaps]), times=times)
-    assert track(video, tmp_path / "people", "--clip-seconds", "60") == 0
+    assert track(video, tmp_path / "people", "--clip-seconds", "60", "--smoothing", "none") == 0
     measured = gaps_of(tmp_path / "people", "eva_s001")
     grid = times[0] + np.arange(len(measured)) / 25
     assert abs(len(measured) / 25 - (times[-1] - times[0])) < 0.08
@@ -216,7 +215,7 @@ def test_people_are_added_and_a_bad_video_stops_no_other(tmp_path: Path, capsys:
     assert {row["subject"] for row in read_clip_table(out).values()} == {"ada", "ben", "cleo"}
     assert (out / "vertices_npy" / "ada_s001.npy").stat().st_mtime_ns == first
     assert sorted(read_templates(out / "templates.pkl")) == ["ada", "ben", "cleo"]
-    assert track(tmp_path / "more", out, "--frame-rate", "30") == 2
+    assert track(tmp_path / "more", out, "--scale", "iris") == 2
     assert "was begun with other settings" in capsys.readouterr().err
 
 
@@ -230,6 +229,14 @@ def test_tracks_are_kept_for_the_next_run(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("facediff.data.track.recording.FaceTracker", None)
     assert track(videos / "ada", out) == 0
     assert {path: path.read_bytes() for path in (out / "vertices_npy").iterdir()} == before
+
+
+def test_irises_can_set_the_scale(tmp_path: Path) -> None:
+    video = write_coded_video(tmp_path / "eva.mp4", pictures(talking(3)))
+    assert track(video, tmp_path / "one") == 0
+    assert track(video, tmp_path / "other", "--scale", "iris") == 0
+    one, other = (np.load(tmp_path / name / "vertices_npy" / "eva_s001.npy") for name in ("one", "other"))
+    np.testing.assert_allclose(other, one * 11.7 / 12.0, rtol=2e-3)
 
 
 def test_splits_of_one_person_and_of_many(tmp_path: Path) -> None:
