@@ -177,6 +177,10 @@ def report(error: BaseException) -> int:
     if isinstance(error, OSError):
         name = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return fail(f"{name}{error.strerror or text}; check that it exists, may be used and has room ({more})")
+    if isinstance(error, UnicodeError):
+        return fail(f"a name or a text is not valid UTF-8 ({text}); rename or convert it ({more})")
+    if isinstance(error, RecursionError):
+        return fail(f"an input is nested too deeply; expected plain data ({more})")
     refusal = next((cause for cause in chain(error) if _refuses(cause)), None)
     if refusal is not None:
         return fail(f"{' '.join(str(refusal).split())} ({more})")
