@@ -232,8 +232,9 @@ def fault_of(option: str, name: str) -> str:
 
 def subclasses(kind: registry.Kind) -> set[str]:
     """Names of the imported classes that extend a base of the registered ones."""
-    bases = {base for entry in kind for base in entry.implementation.__mro__ if base.__module__.startswith("facediff.")}
-    return {cls.__name__ for base in bases for cls in type.__subclasses__(base)}
+    ancestors = (base for entry in kind for base in entry.implementation.__mro__)
+    bases: set[type] = {base for base in ancestors if base.__module__.startswith("facediff.")}
+    return {extension.__name__ for base in bases for extension in base.__subclasses__()}
 
 
 def import_fault(option: str, path: str) -> str:

@@ -272,12 +272,14 @@ class FrechetDistance(SumsMetric, ChannelMetric):
 
     def __init__(
         self,
-        region: RegionLike,
+        region: RegionLike | None = None,
         *,
         with_partner: bool = False,
         dims: int = 1,
         **options: Unpack[SequenceOptions],
     ) -> None:
+        if region is None:
+            raise ValueError("the Fréchet distance needs its channels; give a region, such as region=expression")
         frame = "the partner's frame followed by the person's own" if with_partner else "frames"
         definition = f"Fréchet distance between Gaussians of {frame}, over {{region}}, all sequences together [unit²]"
         region = as_region(region, "channels")

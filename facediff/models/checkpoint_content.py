@@ -96,7 +96,7 @@ class CheckpointContent(LightningModule, Inference):
         return self.assets.motion_scale
 
     @property
-    def usual_gate(self) -> str:
+    def usual_gate(self) -> Literal["energy", "off"]:
         """The voice gate of animations that choose none: an imported model gives its authors' motion, in pauses too."""
         return OFF if IMPORTED in self.provenance else USUAL_GATE
 

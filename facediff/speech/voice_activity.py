@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -31,13 +31,13 @@ Wave = npt.NDArray[np.floating]
 HOP = SAMPLE_RATE // 100
 """Samples of a step of 10 ms."""
 
-USUAL_GATE = "energy"
+USUAL_GATE: Final = "energy"
 """The default detector of pauses."""
 
 QUICK_GATE = "energy:attack=0.04,lead=0.02,ahead=0"
 """The same where frames must be certain at once: it looks 0.08 s ahead."""
 
-OFF = "off"
+OFF: Final = "off"
 """In place of a detector's name: the mouth follows the model in pauses too."""
 
 QUIETEST = -65.0

@@ -116,8 +116,9 @@ def run_tasks(
         progress: title of a progress bar; none if empty.
 
     Yields:
-        task and result. The result of a task that kills its process is :class:`WorkerDied`: tasks that were running
-        then are tried again, one at a time, so that no other is lost.
+        task and result. The result of a task that kills its process is
+        :class:`~facediff.utils.workers.WorkerDied`: tasks that were running then are tried again, one at a time, so
+        that no other is lost.
     """
     where = check_scheduler(scheduler) if scheduler != "" else ""
     count = min(workers or processors(), len(tasks), MOST_WORKERS * processors())

@@ -144,9 +144,8 @@ def test_a_corpus_that_is_not_there_is_refused_before_the_model_is_built(tmp_pat
     missing = str(tmp_path / "BIWI")
     with pytest.raises(FaceDiffError, match="BIWI: no such folder"):
         refuse_missing_corpus({"class_path": "facediff.data.Biwi", "init_args": {"root": missing}})
-    recordings = (("Beat", missing, "BIWI: no such folder"), ("LiveLink", str(tmp_path), "holds no recordings"))
-    for name, root, message in recordings:
-        with pytest.raises(FaceDiffError, match=message):
+    for name, root in (("Beat", missing), ("LiveLink", str(tmp_path))):
+        with pytest.raises(FaceDiffError, match="holds no recordings"):
             refuse_missing_corpus({"class_path": f"facediff.data.parametric.{name}", "init_args": {"root": root}})
     refuse_missing_corpus({"class_path": "facediff.data.Biwi", "init_args": {"root": "s3://bucket/biwi.zarr"}})
     refuse_missing_corpus({"class_path": "facediff.data.Puppet", "init_args": {"root": missing}})

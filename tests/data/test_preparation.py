@@ -276,7 +276,7 @@ def test_the_command_reports_the_result(tmp_path: Path, capsys: pytest.CaptureFi
     assert "7 written now" in shown
     assert f"M3_e33: {frame}: has 40 bytes" in shown
     assert "regions/lve.txt: expected in a folder given by --regions" in shown
-    assert "F2_e03 … F2_e40 (36 in all): expected frames in" in shown
+    assert "F2_e03: expected frames in" in shown
     shutil.rmtree(frame.parent)
     shutil.copytree(raw / "faces" / "M3" / "e37", frame.parent)
     assert run("data prepare", arguments) == 0

@@ -64,7 +64,7 @@ def corpora(roots: dict[str, Path], **options: Any) -> Tiny:  # noqa: ANN401
 @pytest.mark.parametrize("name", ["keys", "items", "pop", "forward", "training", "type", "x.y", "clear", "a/b", ""])
 def test_a_name_that_no_part_of_a_model_can_have_is_refused(name: str, roots: dict[str, Path]) -> None:
     further = {name: {"corpus": f"{Halved.__module__}.{Halved.__name__}", "root": str(roots["halved"])}}
-    with pytest.raises(FaceDiffError, match="choose another"):
+    with pytest.raises(FaceDiffError, match="a name that a part of a model can have"):
         Tiny(root=str(roots["tiny"]), further_corpora=further)
 
 
