@@ -234,7 +234,12 @@ def subclasses(kind: registry.Kind) -> set[str]:
     """Names of the imported classes that extend a base of the registered ones."""
     ancestors = (base for entry in kind for base in entry.implementation.__mro__)
     bases: set[type] = {base for base in ancestors if base.__module__.startswith("facediff.")}
-    return {extension.__name__ for base in bases for extension in base.__subclasses__()}
+    extension: type
+    names: set[str] = set()
+    for base in bases:
+        for extension in base.__subclasses__():
+            names.add(extension.__name__)
+    return names
 
 
 def import_fault(option: str, path: str) -> str:
