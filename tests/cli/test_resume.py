@@ -28,7 +28,7 @@ from tests.cli.conftest import SMALL
 Fit = Callable[..., int]
 EVERY_STEP = ["--trainer.callbacks+=facediff.callbacks.LastCheckpoint", "--trainer.callbacks.every_n_steps=1"]
 LONGER = ["--trainer.max_epochs=3", "--data.batch_size=2", "--trainer.limit_val_batches=1", *EVERY_STEP]
-CLOCK = ("/time", "/seconds", "per_sec", "device/")
+CLOCK = ("/time", "/seconds", "per_sec", "device/", "train/batches", "train/samples")
 
 
 def curve(run: Path) -> list[dict[str, str]]:

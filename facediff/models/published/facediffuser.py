@@ -169,8 +169,9 @@ class FaceDiffuser(DiffusionModel):
     def first_state(self, noise: Float[Tensor, "batch frames state"]) -> Float[Tensor, "batch frames state"]:
         """Noise, or noised zeros where the first steps are skipped."""
         state = self.state_space().noise(noise)
-        noise_share = math.sqrt(1.0 - float(self.process.signal[self.steps - self.skip_steps - 1]))
-        return state * noise_share if self.skip_steps else state
+        if not self.skip_steps:
+            return state
+        return state * (1.0 - self.process.signal[self.steps - self.skip_steps - 1]).sqrt()
 
     def sample(
         self, batch: Batch, frames: Int[Tensor, " batch"], noise: NoiseSource, progress: Progress | None = None

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff.data import Batch
-from facediff.errors import FaceDiffError
+from facediff.errors import ArgumentError, FaceDiffError
 from facediff.models.audio_encoders import AudioEncoderFactory, MelEncoder
 from facediff.models.base import Decay
 from facediff.models.graphs import SpeechInput
@@ -162,6 +162,11 @@ class DisentanglementNetwork(nn.Module):
             num_layers=options.speech_layers,
             query=options.speech_query,
         )
+        if len(options.decoder_channels) != len(options.decoder_kernels):
+            raise ArgumentError(
+                {"decoder_channels": options.decoder_channels, "decoder_kernels": options.decoder_kernels},
+                "expected as many kernels as channels",
+            )
         self.decoder = StyleContentDecoder(
             **points,
             content_dim=options.content_dim,

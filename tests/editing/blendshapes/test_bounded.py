@@ -98,7 +98,7 @@ def test_built_in_shapes_are_of_the_nearest_speaker(tmp_path: Path, monkeypatch:
     # A folder of that name goes first.
     monkeypatch.chdir(tmp_path)
     Path("puppet").mkdir()
-    with pytest.raises(FaceDiffError, match="holds no shapes"):
+    with pytest.raises(FaceDiffError, match="holds 0 shapes"):
         read_shapes(Path("puppet"), neutral)
 
 
