@@ -2,9 +2,9 @@
 
 Run ``python tools/benchmarks/sampling.py``: 10 s of noise as speech, 23 370 vertices as in BIWI, HuBERT base and the
 dual-path network at width 512, all with random weights, so nothing is downloaded. The default sampler is run from
-start to end, as is a student with the mel encoder in HuBERT's place and a few steps. A step's cost does not depend on its number, so for the other samplers a few steps are
-timed and multiplied. The quickest of the repeats counts, since other programs make work slower but never quicker, and
-steps that are compared take turns.
+start to end, as is a student with the mel encoder in HuBERT's place and a few steps. A step's cost does not depend on
+its number, so for the other samplers a few steps are timed and multiplied. The quickest of the repeats counts, since
+other programs make work slower but never quicker, and steps that are compared take turns.
 """
 
 from __future__ import annotations
