@@ -8,7 +8,7 @@ import re
 import secrets
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -204,16 +204,18 @@ def entered_run(
         trainer.loggers = run_loggers(trainer.loggers, entries, run, content or {})
         with ExitStack() as stack:
             if trainer.is_global_zero and (trainer.logger is not None or checkpoints):
+                own = run_folder(trainer)
+                left = [lock.parent for lock in own.parent.glob(f"*/{LOCK}")]  # of killed runs and of those at work
                 try:
-                    stack.enter_context(locked(run_folder(trainer) / LOCK, "facediff fit"))
+                    stack.enter_context(locked(own / LOCK, "facediff fit"))
                 except LockedError:
                     if numbered and entries:
                         continue  # new loggers look for a free number again
                     raise
-                remove_partial(run_folder(trainer), recursive=True)
-                for other in run_folder(trainer).parent.glob("*/"):  # leftovers of runs that were killed
-                    with suppress(FaceDiffError, OSError), locked(other / LOCK, ""):
-                        remove_partial(other, recursive=True)
+                for folder in left:  # no other: half-written files elsewhere may be of a command at work
+                    held = nullcontext() if folder == own else locked(folder / LOCK, "")
+                    with suppress(FaceDiffError, OSError), held:
+                        remove_partial(folder, recursive=True)
             yield
             return
 

@@ -35,6 +35,16 @@ def test_the_lock_of_a_run_that_goes_on_stays(tmp_path: Path) -> None:
             assert (tmp_path / "small" / "version_1" / LOCK).is_file()
 
 
+def test_a_folder_next_to_a_run_that_no_run_has_locked_is_left_alone(tmp_path: Path) -> None:
+    half = files._partial(tmp_path / "films" / "hello.mp4", ".mp4")  # of a command that is at work
+    half.parent.mkdir()
+    half.write_bytes(b"x")
+    trainer = Trainer(logger=CSVLogger(tmp_path, name=""), accelerator="cpu", enable_progress_bar=False)
+    with entered_run(trainer, []):
+        assert run_folder(trainer).parent == tmp_path
+        assert [*half.parent.iterdir()] == [half]
+
+
 @pytest.mark.parametrize(("name", "logs"), [("SIGTERM", True), ("SIGUSR1", True), ("SIGUSR1", False)])
 def test_a_job_of_slurm_that_was_stopped_continues_its_run(
     name: str, logs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
