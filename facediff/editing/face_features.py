@@ -289,7 +289,7 @@ class FrontView:
         # Points seen through a hole lie behind its rims, and the way round the hole may be short.
         parted |= pairs[:, 1] - pairs[:, 0] > max(2, HOLE * PIXELS)
         pairs, above, below, first, second = (part[parted] for part in (pairs, above, below, first, second))
-        selection = _widest(pairs, columns, window, step, low)
+        selection = _widest(pairs, window, step, low)
         if selection is None:
             return None
         return self._opening(pairs[selection], first[selection], second[selection], above[selection], below[selection])
@@ -416,7 +416,7 @@ def _following(valid: npt.NDArray[np.bool_], tall: int) -> Indices:
     return np.stack([rows[:-1][same], rows[1:][same], columns[1:][same]], axis=1)
 
 
-def _widest(pairs: Indices, columns: int, window: SearchWindow, step: float, low: Array) -> Indices | None:
+def _widest(pairs: Indices, window: SearchWindow, step: float, low: Array) -> Indices | None:
     """Which pairs are the opening: the chain of neighbouring ones that is widest and nearest to the middle."""
     from scipy.spatial import cKDTree
 

@@ -158,7 +158,7 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
     end = re.search(rb"^end_header[ \t]*\r?\n", data[:HEADER], re.MULTILINE)
     if not data.startswith(b"ply") or end is None:
         raise ValueError("its header is not that of a PLY file, or does not end")
-    elements, form = _ply_header(data[: end.start()].decode("latin-1").split("\n"), path)
+    elements, form = _ply_header(data[: end.start()].decode("latin-1").split("\n"))
     body = memoryview(data)[end.end() :]
     columns = _ply_text(elements, bytes(body).split()) if form == "ascii" else _ply_binary(elements, body)
     vertex = columns["vertex"]
@@ -176,7 +176,7 @@ def _read_ply(data: bytes, path: Path) -> Mesh:
     return Mesh(points, _cut(faces[names[0]] if names else [], len(points)), colours)
 
 
-def _ply_header(lines: list[str], path: Path) -> tuple[list[_Element], str]:
+def _ply_header(lines: list[str]) -> tuple[list[_Element], str]:
     elements: list[_Element] = []
     form = ""
     for line in lines[1:]:

@@ -58,7 +58,6 @@ SwayAngle = Annotated[float, Range(0, 15, above=True)]
 USUAL_SWAY = 2.0
 """Degrees where no number is given."""
 Threads = Annotated[int, Range(0, 1024)]
-Tolerance = Annotated[float, Range(1e-15, 1)]
 
 USUAL_VOICE_STEPS = 600
 """Training steps in which an audio encoder learns other voices where no number is given."""
