@@ -81,7 +81,7 @@ COMMANDS = {
     "figure lips": Command("figure:lips", "lip opening over time", "figures"),
     "study make": Command("study:make", "make a user study: videos side by side and a page of questions", "study"),
     "study serve": Command("study:serve", "serve a study's page, and store the answers", "study"),
-    "study report": Command("study:report", "analyse the answers: preference, scores, agreement; plan", "study"),
+    "study report": Command("study:report", "analyse the answers: shares of preference with intervals", "study"),
     "data prepare": Command("data:run", "make a corpus folder from a raw distribution", "prepare"),
     "data check": Command("data:check", "recognise a folder, and report missing and wrong parts"),
     "data pack": Command("data:pack", "pack a corpus, for object storage and small disks", "packed"),
