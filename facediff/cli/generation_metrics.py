@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from facediff.animation.options import LicenceOptions
 from facediff.cli.lightning import corpus_and_folder, prepared
@@ -14,7 +14,7 @@ from facediff.cli.options import Corpus, FileOrList, Folder, Seed
 from facediff.cli.process import tell
 from facediff.errors import check_known
 from facediff.utils import ranges
-from facediff.utils.hub import check_model_source
+from facediff.utils.hub import bundled_by_name, check_model_source, is_graphs
 from facediff.utils.option import Option
 
 if TYPE_CHECKING:
@@ -70,11 +70,11 @@ def generation_metrics(
     deviations.
 
     For example:
-      facediff generation-metrics demo/puppet.ckpt
+      facediff generation-metrics puppet --max-clips 10
       facediff generation-metrics a.ckpt b.ckpt c.ckpt --sampler ddpm --steps 1000 --samples 4 --json abc.json
 
     Args:
-        checkpoints: trained models (.ckpt) of one corpus
+        checkpoints: trained models of one corpus: .ckpt files, or folders of `facediff export-model`
         splits: val, test_a, test_b, test_c (default: all test splits)
         max_clips: clips of a split at most, evenly spread, for a quick look (default: all)
         data_root: where the corpus is, if not where it was in training
@@ -87,11 +87,14 @@ def generation_metrics(
         samples: how many motions, and how they are sampled.
         licence: which models are refused.
     """
+    checkpoints = [Path(bundled_by_name(path)) for path in checkpoints]
     for path in checkpoints:
-        check_model_source(path)
+        if not is_graphs(path):
+            check_model_source(path)
     check_known("--splits", "split", splits or (), SPLITS)
     from facediff.models.base import load_model
     from facediff.models.generation_metrics import SamplingOptions, measure
+    from facediff.pipelines.exported_model import ExportedModel
     from facediff.pipelines.trained import usable_device
     from facediff.utils.plain_files import write_json, write_rows
     from facediff.utils.progress import progress_bar
@@ -104,7 +107,12 @@ def generation_metrics(
     splits = list(dict.fromkeys(splits)) if splits else data.test_splits
     counts = [min(len(data.clips(name)), max_clips or 10**9) for name in splits]
     commercial_only = licence.commercial_only
-    models = {str(path): partial(load_model, path, device, commercial_only=commercial_only) for path in checkpoints}
+    models = {
+        str(path): partial(ExportedModel.open, path, data.assets(), commercial_only=commercial_only)
+        if is_graphs(path)
+        else partial(load_model, path, device, commercial_only=commercial_only)
+        for path in checkpoints
+    }
     with progress_bar("clips", sum(counts) * len(checkpoints), shown=not quiet) as step:
         scores = measure(models, data, splits=splits, sampling=sampling, most_clips=max_clips, step=step)
     if json is not None:
@@ -117,10 +125,19 @@ def generation_metrics(
 def corpus_of_checkpoint(
     checkpoint: Path, data_root: Path | None, corpus: str | None, eyelid_pairs: str | None
 ) -> SpeechMotionDataModule:
-    """The corpus that a checkpoint was trained on."""
+    """The corpus that a model was trained on; a folder of graphs has its name only."""
+    from facediff.cli.data import find_own_module
+    from facediff.data.check.layouts import by_name
     from facediff.models.checkpoint import read_checkpoint
+    from facediff.runtime.folder import read_folder
 
-    module, options = corpus_and_folder(checkpoint, read_checkpoint(checkpoint), corpus, data_root)
+    options: dict[str, Any]
+    if is_graphs(checkpoint):
+        find_own_module(corpus or "")
+        module = by_name(corpus or read_folder(checkpoint)[0].corpus, None)
+        options = {} if data_root is None else {"root": str(data_root)}
+    else:
+        module, options = corpus_and_folder(checkpoint, read_checkpoint(checkpoint), corpus, data_root)
     if eyelid_pairs is not None:
         options["eyelid_pairs"] = str(Path(eyelid_pairs).resolve())
     return prepared(module(**options))

@@ -494,7 +494,8 @@ def sampler_of(model: AnimationModel) -> str:
     sampler = getattr(model, "sampler", None)
     if sampler is None:
         return type(model).__name__
-    description = f"{name_of(type(sampler))} with {counted(sampler.steps, 'step')}"
+    is_text = isinstance(sampler, str)  # of graphs
+    description = sampler if is_text else f"{name_of(type(sampler))} with {counted(sampler.steps, 'step')}"
     expressivity = model.expressivity
     if isinstance(expressivity, Tensor):
         return f"{description}, expressivity by vertex"

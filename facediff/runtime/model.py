@@ -79,6 +79,7 @@ class RuntimeModel(ExportedGraphs):
         audio: Array,
         stream: RuntimeStream,
         progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
+        frames: int | None = None,
     ) -> Iterator[Array]:
         """The same part by part: all of a short recording at once, a long one by windows.
 
@@ -86,9 +87,10 @@ class RuntimeModel(ExportedGraphs):
             audio: speech at 16 kHz.
             stream: at its beginning; it says who moves, and how.
             progress: wraps the iteration over the seconds of a long recording.
+            frames: of the motion, where they are known.
         """
         audio = np.ascontiguousarray(audio, np.float32)
-        frames = self.clock.frames(len(audio))
+        frames = self.clock.frames(len(audio)) if frames is None else frames
         if frames < 1:
             raise FaceDiffError(f"the speech is shorter than one frame ({1 / self.frame_rate:.3f} s); give more of it")
         if not self.windows.in_one_pass(frames, self.frame_rate):

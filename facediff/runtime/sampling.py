@@ -51,6 +51,7 @@ class RuntimeConditions:
     style_name: str
     template: Array
     choices: RuntimeChoices
+    clip: str = NAME  # for which the noise is drawn
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,8 @@ def clip_motion(model: ExportedGraphs, speech: WindowSpeech, conditions: Runtime
         noise = NormalStream(conditions.choices.seed)  # such a model predicts no mean, so there is no other noise
         motion = SamplerRun(model, conditions, None, 0).run(features, noise, noise)
     else:
-        noises = stream_of(NAME, conditions.choices.seed), stream_of(f"{NAME}/mean", 0)
+        name, seed = conditions.clip, conditions.choices.seed
+        noises = stream_of(name, seed), stream_of(f"{name}/mean", 0)
         motion = SamplerRun(model, conditions, None, 0).run(features, *noises)
     if motion.shape[1] == speech.frames:
         return motion
@@ -107,8 +109,8 @@ def window_motion(
     features = np.take(features_of(model, speech, speech.frames), window.encoded, axis=1)
     new, last = slice(window.fixed, window.frames), slice(max(0, window.frames - window.kept), window.frames)
     sampling = SamplerRun(model, conditions, before, window.shared, new)
-    noise = NumpyWindowNoise(NAME, window, conditions.choices.seed)
-    motion = sampling.run(features, noise, NumpyWindowNoise(f"{NAME}/mean", window, 0))
+    noise = NumpyWindowNoise(conditions.clip, window, conditions.choices.seed)
+    motion = sampling.run(features, noise, NumpyWindowNoise(f"{conditions.clip}/mean", window, 0))
     return motion, [tail[:, last] for tail in sampling.kept]
 
 

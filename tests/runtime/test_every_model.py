@@ -16,10 +16,14 @@ import pytest
 import torch
 
 from facediff import registry
+from facediff.data import collate
+from facediff.data.batch import UNKNOWN_IDENTITY
 from facediff.errors import FaceDiffError
 from facediff.models import AnimationModel
+from facediff.models.evaluation import with_identity
 from facediff.models.graphs import Graph
 from facediff.pipelines.export_model import arrays_of, describe, export_model, record
+from facediff.pipelines.exported_model import ExportedModel
 from facediff.runtime import RuntimeModel
 from facediff.speech.windows import WindowPlan
 from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
@@ -147,6 +151,26 @@ def test_runtime_gives_what_the_model_gives(case: str, tiny_root: Path, sources:
     runtime = in_eager(model)
     for seconds, identity in ((0.3, "B"), (1.013, UNSEEN), (4.317, "A")):  # the last one by windows
         assert_alike(runtime, model, seconds, identity, seed=5)
+
+
+@pytest.mark.parametrize("case", ["dual path in channels", "style content", "Voca", "FaceDiffuser"])
+def test_scores_of_graphs_are_of_the_motion_that_the_model_makes(case: str, tiny_root: Path, sources: Sources) -> None:
+    """For its own speakers, those of others, and speakers whose name is hidden; with a style of motion or by name."""
+    model = ready(case, tiny_root, sources)
+    data = TinyChannels(root=str(sources["channels"])) if "channels" in case else Tiny(root=str(tiny_root))
+    exported = ExportedModel.of(in_eager(model), model.assets)
+    assert exported.samples == model.samples
+    known, hidden = data.dataset("test_a")[0], data.dataset("test_b")[0]
+    for sample in (known, hidden, replace(known, identity=UNKNOWN_IDENTITY)):
+        batch = collate([sample])
+        with torch.inference_mode():
+            wanted = model.sample_clip(batch, [3])
+            assert torch.allclose(exported.sample_clip(batch, [3]), wanted, atol=1e-4 * float(wanted.abs().max()))
+            usual, of_folder = model.default_style("B"), exported.default_style("B")
+            vectors = [
+                each.style_of(with_identity(batch, 1, style)) for each, style in ((model, usual), (exported, of_folder))
+            ]
+        assert torch.allclose(*vectors, atol=1e-2)
 
 
 def test_channels_are_decoded_by_the_rig_of_the_face(tiny_root: Path, sources: Sources) -> None:

@@ -23,6 +23,7 @@ from facediff import registry
 from facediff.animation import write_archive
 from facediff.animation.options import AnimationOptions
 from facediff.animation.styles import marked
+from facediff.cli.app import main
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models import AnimationModel, DualPathDiffusion
 from facediff.models.graphs import update_table
@@ -130,6 +131,20 @@ def folder(model: AnimationModel, tmp_path_factory: pytest.TempPathFactory) -> P
         if not path.exists():
             export_model(model, path)
     return path
+
+
+def test_a_folder_is_scored_on_the_corpus_that_is_named(
+    folder: Path, tiny_root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["generation-metrics", str(folder), "--corpus", "tests.fakes.tiny.Tiny", "--data-root", str(tiny_root)]
+    sampled = ["--samples", "2", "--references", "1", "--max-clips", "1", "--quiet"]
+    assert main([*words, *sampled, "--expressivity", "0"]) == 0
+    printed = capsys.readouterr().out
+    assert "clips: 1 of test_a, 1 of test_b; 2 samples each; dpm_solver with 3 steps, expressivity 0" in printed
+    spread = next(line for line in printed.splitlines() if "spread / error, whole face" in line)
+    assert spread.split()[-2:] == ["0.000", "0.000"]
+    assert main([*words, *sampled, "--steps", "2"]) == 2
+    assert "omit --sampler and --steps" in capsys.readouterr().err
 
 
 def sound(seconds: float) -> np.ndarray:
