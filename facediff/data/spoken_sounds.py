@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from facediff.data.augmentation import Augmenter
 from facediff.data.datamodule import SpeechMotionDataModule
 from facediff.errors import FaceDiffError
 from facediff.speech.audio import samples_for
@@ -33,6 +34,11 @@ BRIEF = (1, 2)
 """Sounds that mark the frame of their middle, however short they are."""
 MOST = 100
 """Recordings of a speaker that are used."""
+CHANGED = 0.7
+"""Share of people's pieces that the corpus's augmentations change, at least.
+
+Other rooms, microphones and voices cost nothing here, since no motion has to fit them.
+"""
 
 
 def visible_sound(ipa: str) -> int:
@@ -88,7 +94,8 @@ class SpokenSounds:
 
     def __init__(self, recordings: Path, data: SpeechMotionDataModule) -> None:
         self.frame_rate = data.frame_rate
-        self.augmenter = data.augmenter
+        self.augmenter = given = data.augmenter
+        self.of_people = given and Augmenter(given.augmentations, max(CHANGED, given.share))
         self.people: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]] = []
         for speaker in speakers_of(recordings):
             for recording in recordings_of(speaker, MOST):
@@ -110,12 +117,14 @@ class SpokenSounds:
             if self.clips and number % 2:
                 index = int(random.integers(len(self.clips)))
                 read, known = partial(self.corpus.read_audio, self.clips[index][0]), self._sounds_of(index)
+                augmenter = self.augmenter
             else:
                 speech, known = self.people[int(random.integers(len(self.people)))]
-                read = partial(self._stretch, speech)
+                read, augmenter = partial(self._stretch, speech), self.of_people
             length = min(len(known), max(1, round(seconds * self.frame_rate)))
             start = int(random.integers(len(known) - length + 1))
-            pieces.append(self._augmented(read(start, start + length), int(random.integers(2**31))))
+            piece, seed = read(start, start + length), int(random.integers(2**31))
+            pieces.append(piece if augmenter is None else torch.from_numpy(augmenter(piece.numpy(), seed)))
             sounds.append(torch.from_numpy(known[start : start + length]))
         pad = torch.nn.utils.rnn.pad_sequence
         return SoundBatch(
@@ -136,8 +145,3 @@ class SpokenSounds:
         """Samples of a recording from one frame to another."""
         first, last = (samples_for(frame, self.frame_rate) for frame in (start, stop))
         return torch.from_numpy(speech[first:last])
-
-    def _augmented(self, speech: Tensor, seed: int) -> Tensor:
-        if self.augmenter is None:
-            return speech
-        return torch.from_numpy(self.augmenter(speech.numpy(), seed))

@@ -68,6 +68,15 @@ def test_pieces_are_peoples_and_the_corpuss_in_turn(recordings: Path, two_clips:
     assert all(any(np.array_equal(window, batch.audio[k].numpy()) for window in windows) for k in (1, 3))
 
 
+def test_people_are_changed_more_often_than_the_corpus(recordings: Path, two_clips: str) -> None:
+    loud = SpokenSounds(recordings, Puppet(root=two_clips, augmentations=["loudness:share=1"], augmented_share=0.1))
+    plain = SpokenSounds(recordings, Puppet(root=two_clips))
+    pieces = [each.draw(200, 0.2, np.random.default_rng(0)).audio for each in (loud, plain)]
+    changed = (pieces[0] != pieces[1]).any(1).float()
+    assert 0.6 < changed[::2].mean() < 0.8
+    assert 0.02 < changed[1::2].mean() < 0.2
+
+
 def test_the_encoder_learns_the_sounds_and_nothing_else_changes(
     recordings: Path, make_model: Make, make_trainer: Make, tiny: Tiny
 ) -> None:
