@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import difflib
 import importlib
+import inspect
 import json
 import os
 import re
@@ -373,6 +374,9 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     if data in (None, trained, trained.rpartition(".")[2]):
         corpus, corpus_options = corpus_of(path, checkpoint)
         if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in arguments):
+            needed = inspect.signature(corpus).parameters["root"].default is inspect.Parameter.empty
+            if needed and corpus_options.get("root") is None:
+                raise FaceDiffError(f"{path}: does not say where the corpus is; add --data.root=FOLDER")
             tell_folder(path, corpus_options)
         config["data"] = {"class_path": f"{corpus.__module__}.{corpus.__qualname__}", "init_args": corpus_options}
     return ["--config", yaml.safe_dump(config, sort_keys=False)]
