@@ -211,6 +211,7 @@ def test_wild_arguments_of_a_component(
 
 
 @WILD
+@pytest.mark.filterwarnings("ignore:.*a sub-sample of")
 @pytest.mark.parametrize("made", [Tiny, *(e.implementation for e in registry.corpus)], ids=lambda made: made.__name__)
 def test_wild_arguments_of_a_corpus(
     made: type[SpeechMotionDataModule], values: Iterable[object], tiny_root: object
