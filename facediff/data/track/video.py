@@ -29,6 +29,8 @@ def read_pictures(path: Path) -> Iterator[tuple[float, Picture]]:
         import av
     try:
         with path.open("rb") as stream, av.open(stream, options={"format_whitelist": DEMUXERS}) as container:
+            if not container.streams.video:
+                raise FaceDiffError(f"{path}: has no pictures; expected a video of a person")
             track = container.streams.video[0]
             rate = float(track.average_rate or 25)
             step, last = math.ceil(rate / MOST_PICTURES), -math.inf
@@ -41,5 +43,5 @@ def read_pictures(path: Path) -> Iterator[tuple[float, Picture]]:
                 # FFmpeg counts counterclockwise, as NumPy does.
                 turned = np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture
                 yield time, np.ascontiguousarray(turned)
-    except (av.FFmpegError, OSError, ValueError, IndexError) as error:  # the last without a stream of pictures
+    except (av.FFmpegError, OSError, ValueError) as error:
         raise FaceDiffError(f"{path}: is not a video that can be read ({brief(error)}); convert it to .mp4") from error

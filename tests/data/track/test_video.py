@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 
 from facediff.data.track.video import read_pictures
 from facediff.errors import FaceDiffError, Note
@@ -64,6 +65,12 @@ def test_a_hole_in_the_sound_is_silence(tmp_path: Path) -> None:
 
 
 def test_sound_alone_is_no_video(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "a.wav", np.zeros(16_000), 16_000)
+    with pytest.raises(FaceDiffError, match="has no pictures"):
+        list(read_pictures(tmp_path / "a.wav"))
+
+
+def test_half_a_file_is_no_video(tmp_path: Path) -> None:
     path = write_coded_video(tmp_path / "a.mp4", [shaded()] * 3)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(FaceDiffError, match="is not a video that can be read"):
