@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
 import nbformat
@@ -81,6 +83,8 @@ def test_the_notebook_runs(path: Path, kernel: KernelManager, tmp_path: Path) ->
 
 def test_the_notebooks_are_committed_with_small_outputs() -> None:
     assert len(NOTEBOOKS) >= 4
+    needs = [need for need in metadata.requires("facediff") or () if not re.search("extra == .(?:dev|docs|test)", need)]
+    packages = {re.split(r"[^\w-]", need)[0].replace("-", "_") for need in needs} | sys.stdlib_module_names
     for path in NOTEBOOKS:
         notebook = nbformat.read(path, as_version=4)
         nbformat.validate(notebook)
@@ -90,3 +94,6 @@ def test_the_notebooks_are_committed_with_small_outputs() -> None:
         text = path.read_text(encoding="utf-8")
         assert len(text) < 30_000, path
         assert not re.search(r"/(?:tmp|home|root|work|opt|Users)/", text), path
+        imported = set(re.findall(r'^ *"(?:from|import) (\w+)', text, re.MULTILINE))
+        first_line = next(line for line in text.splitlines() if "You need `pip install" in line)
+        assert {name for name in imported - packages if name not in first_line} == set(), path
