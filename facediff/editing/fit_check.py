@@ -17,8 +17,7 @@ from facediff.utils.numerics import Array, Floats, Integers
 
 FRAMES = 24  # As many frames, evenly spread, and the one with the widest mouth are looked at
 LIP_RATIO = 0.22
-"""Gap at rest over gap at the widest between the lips: at most 0.2 where the mouth works, from 0.23 where lips are
-glued, torn or swapped."""
+"""Gap at rest over gap at the widest between the lips, along the way that they part."""
 SPEAKS = 0.003  # metres: an animation whose lips part by less says nothing of the other mesh's lips
 CLEARLY_OPENS = 0.75  # A mouth of which every third opens by this share is not glued
 OPENS = 0.4  # A third of the mouth must open by this share of what the animation's does
@@ -93,10 +92,13 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
             )
         elif opening * metres_per_unit(animation.unit) > SPEAKS and target is not None:
             facing = target.lips(correspondence.laid.vertices, LIPS)
-            gaps = _gaps(np.stack([carried.template, carried.vertices[widest]]), facing)
+            # Along the way that the lips part: facing vertices of a coarse mesh do not lie above one another.
+            parting = _apart(animation, pairs, widest)[1] - _apart(animation, pairs, widest)[0]
+            way = parting.mean(axis=0) / np.linalg.norm(parting.mean(axis=0))
+            gaps = _apart(carried, facing, widest) @ (rotation @ way)
             lips = {
                 "lip_ratio": float(gaps[0].mean() / max(gaps.mean(axis=1).max(), 1e-12)),
-                "opened": _opened(gaps[1] - gaps[0], scale * (moving[widest] - rest)),
+                "opened": _opened(gaps[1] - gaps[0], scale * (parting @ way)),
                 "torn": _torn(animation, carried, pairs, facing, widest, scale * rotation, scale * opening),
                 "crossed": _crossed(animation, carried, pairs, facing, frames, rotation @ [0.0, 1.0, 0.0], scale),
             }
@@ -165,6 +167,12 @@ def _torn(
     expected = (np.float64(animation.vertices[frame][pairs]) - animation.template[pairs]) @ matrix.T
     moved = np.float64(carried.vertices[frame][facing]) - carried.template[facing]
     return float(np.mean(np.linalg.norm(moved - expected, axis=2) > 0.5 * opening))
+
+
+def _apart(animation: Animation, pairs: Integers, frame: int) -> Array:
+    """From one lip to the other at rest and in a frame, (2, P, 3)."""
+    frames = np.float64([animation.template, animation.vertices[frame]])
+    return np.asarray(frames[:, pairs[:, 0]] - frames[:, pairs[:, 1]])
 
 
 def _gaps(frames: Floats, pairs: Integers) -> Array:

@@ -21,7 +21,7 @@ from facediff.mesh import Mesh
 from facediff.mesh.flame import rotations
 from facediff.mesh.mesh import triangle_areas
 from facediff.synthetic.head.parts import build_head
-from tests.fakes.heads import FAMILY, INTERIOR, Head, person, sealed_lips, talking
+from tests.fakes.heads import FAMILY, INTERIOR, Head, person, sealed_lips, talking, talking_second
 from tests.fakes.small_face import M2, Shape, small_shapes
 
 
@@ -153,6 +153,20 @@ def test_the_lips_of_the_puppet_are_found_without_being_told(animation: Animatio
     assert [eye is not None and eye.centre[:2] == pytest.approx([x, 0.0255], abs=0.003) for eye, x in zip(
         seen.eyes, (-0.032, 0.032), strict=True
     )] == [True, True]  # fmt: skip
+
+
+def test_a_calm_mouth_on_a_coarse_mesh_parts_its_lips() -> None:
+    """Facing vertices of a coarse mesh lie beside one another, by a third of the gap of a mouth that opens by 4 mm."""
+    lively = talking_second()
+    points, faces = fast_simplification.simplify(lively.template, lively.triangles, target_reduction=0.5)
+    moved = lively.template + np.float32(0.3) * (lively.vertices - lively.template)
+    calm = replace(lively, vertices=moved)
+    found = correspond(calm.template, calm.triangles, points, faces)
+    report = transfer_checked(calm, found, Mesh(points, faces.astype(np.int32)))[2]
+    assert report.good, report.faults
+    assert report.lip_ratio is not None
+    assert report.lip_ratio < 0.1
+    assert report.opened == pytest.approx(1, abs=0.05)
 
 
 def test_an_eye_is_no_mouth(animation: Animation, monkeypatch: pytest.MonkeyPatch) -> None:
