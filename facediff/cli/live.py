@@ -19,9 +19,6 @@ from facediff.live.options import LiveOptions
 from facediff.utils.hub import BUNDLED, check_animating_source, is_audio2face, model_or_bundled
 from facediff.utils.option import Option
 
-SOUNDS = (".wav", ".flac", ".ogg", ".mp3", ".opus")
-"""Suffixes by which a recording is recognised in the model's place; the bundled model animates it then."""
-
 if TYPE_CHECKING:
     from facediff.live.model import LiveModel
 
@@ -60,11 +57,14 @@ def live(
         controls: changes after inference.
         device: where the model computes.
     """
+    from facediff.speech.audio import RECORDINGS
+
     if checkpoint is not None:
         if speech is not None:
             raise FaceDiffError(f"{model}: one model too many; give it alone, or --checkpoint")
         model, speech = checkpoint, model
-    if model is not None and speech is None and (str(model) == "-" or model.suffix.lower() in SOUNDS):
+    # A recording in the model's place is animated by the bundled model.
+    if model is not None and speech is None and (str(model) == "-" or model.suffix.lower() in RECORDINGS):
         model, speech = None, model
     model = model_or_bundled(model)
     check_animating_source(model)

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from facediff.errors import FaceDiffError, counted, needs_extra
-from facediff.speech.audio import read_speech, write_wav
+from facediff.speech.audio import RECORDINGS, read_speech, write_wav
 from facediff.speech.phonemes import closing
 from facediff.speech.text_grids import SILENCES, WORDS, Interval, find_tier, phones_in, read_text_grid, write_text_grid
 from facediff.utils import SAMPLE_RATE
@@ -29,7 +29,6 @@ from facediff.utils.batch import FileTask, Recipe, run_batch
 from facediff.utils.files import atomic
 from facediff.utils.jobs import PerWorker
 
-SOUNDS = (".wav", ".flac", ".mp3", ".m4a", ".ogg", ".opus")
 SHORTEST, LONGEST = 2.5, 8.0
 """Seconds of a piece: shorter ones are joined to the next, longer ones are cut between words."""
 LEAST = 1.0  # seconds of a piece that is kept
@@ -71,11 +70,11 @@ def find_recordings(source: Path) -> dict[Path, str]:
     found: dict[Path, str] = {}
     for path in sorted(source.rglob("*")):
         parts = path.relative_to(source).parts
-        if path.suffix.lower() in SOUNDS and not any(part.startswith(".") for part in parts):
+        if path.suffix.lower() in RECORDINGS and not any(part.startswith(".") for part in parts):
             found[path] = parts[0] if len(parts) > 1 else path.stem.partition("-")[0]
     if not found:
         raise FaceDiffError(
-            f"{source}: holds no recordings; expected {', '.join(SOUNDS)}, in a folder for each speaker"
+            f"{source}: holds no recordings; expected {', '.join(RECORDINGS)}, in a folder for each speaker"
         )
     return found
 

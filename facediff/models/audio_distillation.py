@@ -31,7 +31,7 @@ from facediff.data.augmentation import Augmenter, read_augmentations
 from facediff.errors import FaceDiffError, OptionError
 from facediff.models.base import AnimationModel
 from facediff.models.layers import frame_mask
-from facediff.speech.audio import read_speech
+from facediff.speech.audio import RECORDINGS, read_speech
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import USUAL_VOICE_STEPS
 from facediff.utils.workers import processors
@@ -58,7 +58,6 @@ STEP_RATE = 50
 
 MOST_RECORDINGS, LONGEST = 1200, 8.0
 """People's recordings that are used, of more so many are drawn, and seconds of each. They take 0.6 GB at most."""
-SOUNDS = (".wav", ".flac", ".ogg", ".mp3")
 
 
 @dataclass(frozen=True)
@@ -243,7 +242,7 @@ class SpeechPairs(Dataset[DistillationBatch]):
 
 def read_recordings(folder: Path, seed: int) -> list[npt.NDArray[np.float32]]:
     """People's recordings in any folders below one, (S,) at 16 kHz each."""
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SOUNDS)
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in RECORDINGS)
     if not files:
         raise OptionError("people", "no recording there; expected .wav or .flac", folder)
     chosen = np.random.default_rng(seed).permutation(len(files))[:MOST_RECORDINGS]

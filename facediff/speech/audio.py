@@ -46,6 +46,8 @@ SUFFIXES = (".wav", ".flac", ".ogg", ".mp3", ".opus", ".aiff")
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".flv", ".mpg", ".mpeg", ".ts", ".mts", ".wmv", ".3gp")
 CONTAINERS = (*VIDEOS, ".m4a", ".aac")
 """Videos and similar containers; PyAV extracts their sound."""
+RECORDINGS = (*SUFFIXES, ".m4a", ".aac")
+"""Files that hold sound alone."""
 
 DEMUXERS = "flv,mov,mp4,m4a,matroska,webm,avi,asf,aac,ac3,eac3,amr,mpegts,mpeg,mp3,ogg,wav,flac,aiff,au,w64,caf"
 """What FFmpeg may take such a file for: not a playlist, which names other files and addresses to be opened."""
