@@ -7,11 +7,12 @@ from typing import Annotated, Any
 
 import torch
 from lightning.pytorch import LightningModule, Trainer
-from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.callbacks import StochasticWeightAveraging, WeightAveraging
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
 from facediff.data import SpeechMotionDataModule
+from facediff.errors import FaceDiffError
 from facediff.models.base import AnimationModel
 from facediff.utils.hints import checks_arguments
 from facediff.utils.ranges import Range
@@ -46,6 +47,13 @@ class EmaWithWarmup(WeightAveraging):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Copy the whole model; its own set-up by the corpus comes later."""
+        callbacks = getattr(trainer, "callbacks", ())
+        averaging = [c for c in callbacks if isinstance(c, WeightAveraging | StochasticWeightAveraging)]
+        if stage == "fit" and len(averaging) > 1:
+            raise FaceDiffError(
+                f"--trainer.callbacks: {' and '.join(type(callback).__name__ for callback in averaging)} average the "
+                f"weights, and a checkpoint has one average; leave one, with --trainer.callbacks=[] before others"
+            )
         data = getattr(trainer, "datamodule", None)
         if stage == "fit" and isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
             pl_module.make_parts(data.assets())

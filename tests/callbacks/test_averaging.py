@@ -11,9 +11,10 @@ import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, StochasticWeightAveraging
 
 from facediff.callbacks import EmaWithWarmup
+from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion
 from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import Tiny
@@ -51,6 +52,13 @@ def test_the_average_is_that_of_the_formula(decay: float, warmup: float) -> None
         d = min(decay, (1 + k) / (warmup + k))
         expected.append(d * expected[-1] + (1 - d) * weights[k])
     np.testing.assert_allclose(averages(weights, decay=decay, warmup=warmup), np.array(expected), rtol=1e-5, atol=1e-6)
+
+
+def test_a_second_average_is_refused_since_checkpoints_have_one() -> None:
+    callback = EmaWithWarmup()
+    trainer: Any = SimpleNamespace(callbacks=[callback, StochasticWeightAveraging(swa_lrs=0.1)])
+    with pytest.raises(FaceDiffError, match="EmaWithWarmup and StochasticWeightAveraging"):
+        callback.setup(trainer, Weights(), "fit")
 
 
 def test_the_first_weights_are_forgotten_in_a_short_training() -> None:
