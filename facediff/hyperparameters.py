@@ -153,7 +153,8 @@ def read_component(source: str, name: str, value: object, components: Components
 def unknown_class(source: object, role: str, path: object) -> FaceDiffError:
     """The error for a class that is neither registered nor imported."""
     text = quoted(path).strip("'\"")
-    advice = f", or add --model={text} to `facediff test`, `validate` or `predict`" if role == "model" else ""
+    option = "--model" if role == "model" else f"--model.{role}" if role in COMPONENTS else ""
+    advice = f", or add {option}={text} to `facediff test`, `validate` or `predict`" if option else ""
     return FaceDiffError(
         f'{source}: its {role} is "{text}", which is not known; it was not loaded. If you trust the file, install or '
         f"import the package that the {role} comes from{advice}"

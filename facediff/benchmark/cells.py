@@ -92,6 +92,14 @@ def hash_of(content: object) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
+def with_code(content: dict[str, Any]) -> dict[str, Any]:
+    """Plain data, with the SHA-256 of the working folder's modules and packages that its class paths name."""
+    values = re.findall(r'"([A-Za-z_]\w*)\.[\w.]+\\?"(?!:)', json.dumps(content, default=str))
+    files = [file for name in {*values} - {"facediff"} for file in (Path(f"{name}.py"), *Path(name).rglob("*.py"))]
+    code = {file.as_posix(): sha256(file) for file in files if file.is_file()}
+    return {**content, "code": code} if code else content
+
+
 @dataclass(frozen=True)
 class Row:
     """A row of the tables: a method, or a method in a variant."""
@@ -155,8 +163,8 @@ def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]
             for step in trainings
         ]
         for seed in seeds:
-            trained = {**shared, "seed": seed, "threads": plan.threads, "trainings": steps}
-            recipe = {"kind": "fit", "trained": trained, "weights": plan.weights, "test": scoring}
+            trained = with_code({**shared, "seed": seed, "threads": plan.threads, "trainings": steps})
+            recipe = with_code({"kind": "fit", "trained": trained, "weights": plan.weights, "test": scoring})
             yield Cell(row.name, corpus.name, seed, "fit", trainings, recipe=recipe, trained=trained, **facts)
         return
     kind: Kind = "checkpoint" if method.checkpoint is not None else "predictions"
@@ -168,7 +176,7 @@ def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]
         )
     for seed in seeds if "{seed}" in text else (None,):
         source = _source(plan, kind, text.replace("{corpus}", corpus.name).replace("{seed}", str(seed)))
-        recipe = {**shared, "kind": kind, "source": _content(kind, source), "test": scoring}
+        recipe = with_code({**shared, "kind": kind, "source": _content(kind, source), "test": scoring})
         recipe["options"] = dict(method.options)
         facts |= {"source": source, "options": method.options}
         yield Cell(row.name, corpus.name, seed, kind, recipe=recipe, trained=recipe, **facts)

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from facediff.benchmark.cells import Cell, Training, config_content, hash_of
+from facediff.benchmark.cells import Cell, Training, config_content, hash_of, with_code
 from facediff.benchmark.results import Result, cell_file, model_result, predictions_result, read_result
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
@@ -55,8 +55,8 @@ class Setting:
     truths: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     # Data module of each corpus that is no part of facediff, which a checkpoint may not import by itself
     classes: Mapping[str, str] = field(default_factory=dict)
-    # Class of each trained row's model that is no part of facediff, for the same reason
-    models: Mapping[str, str] = field(default_factory=dict)
+    # Options that name classes of each trained row's model that are no part of facediff, for the same reason
+    models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     # Folders of corpora by the data config, for checkpoints without one of this machine
     roots: Mapping[str, str] = field(default_factory=dict)
     # How a facediff command is started
@@ -124,7 +124,7 @@ def _score_model(setting: Setting, cell: Cell, folder: Path, machine: dict[str, 
         "model.protocol": setting.protocol,
         "model.metrics": metrics,
         **({"data": setting.classes[cell.corpus]} if cell.corpus in setting.classes else {}),
-        **({"model": setting.models[cell.row]} if cell.row in setting.models else {}),
+        **setting.models.get(cell.row, {}),
         **({} if root is None else {"data.root": str(root)}),
         **cell.test_options,
     }
@@ -228,11 +228,11 @@ def fit_options(training: Training, checkpoints: Mapping[str, Path], cell: Cell)
 
 
 def refuse_changed(training: Training, cell: Cell) -> None:
-    """Refuse a config that was edited since the cells were made: its result would bear the hash of the old content."""
+    """Refuse a config or code edited since the cells were made: the result would bear the hash of the old content."""
     (hashed,) = (entry["config"] for entry in cell.trained["trainings"] if entry["name"] == training.name)
-    if hash_of(config_content(training.config)) != hash_of(hashed):
+    if hash_of(config_content(training.config)) != hash_of(hashed) or with_code(cell.trained) != cell.trained:
         raise FaceDiffError(
-            f"{cell}: {training.config} was changed while the benchmark ran; run the benchmark again with it"
+            f"{cell}: {training.config} or its code was changed while the benchmark ran; run the benchmark again"
         )
 
 

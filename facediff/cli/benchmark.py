@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from facediff.cli.options import OutputFolder, Scheduler, Seed, Workers
 from facediff.cli.process import tell
 from facediff.errors import FaceDiffError, check_known, counted, number
+from facediff.registry import COMPONENTS, alias_path, find_class
 from facediff.utils import ranges
 from facediff.utils.option import Option
 
@@ -200,7 +201,7 @@ def check_cells(
     clips: dict[str, dict[str, str]] = {}
     truths: dict[str, tuple[str, ...]] = {}
     classes: dict[str, str] = {}
-    models: dict[str, str] = {}
+    models: dict[str, dict[str, str]] = {}
     roots: dict[str, str] = {}
     tests: dict[tuple[str, str], str] = {}
     kinds: dict[str, type[SpeechMotionDataModule]] = {}
@@ -217,8 +218,7 @@ def check_cells(
                 if mark not in parsed:
                     parsed[mark] = parse_fit(command_line)
                 (model_class, model_options), (class_path, arguments) = parsed[mark]
-                if not model_class.startswith("facediff."):
-                    models[cell.row] = model_class
+                models[cell.row] = own_classes(model_class, model_options)
                 if not class_path.startswith("facediff."):
                     classes[cell.corpus] = class_path
                 data = data_of(prepared, class_path, arguments, make=not dry_run)
@@ -245,6 +245,14 @@ def check_cells(
             with naming(plan, cell):
                 check_checkpoint(cell, kinds.get(cell.corpus), classes.get(cell.corpus), roots.get(cell.corpus))
     return replace(setting, clips=clips, truths=truths, classes=classes, models=models, roots=roots), tests
+
+
+def own_classes(model: str, options: Mapping[str, Any]) -> dict[str, str]:
+    """Options that name the classes of a model that are neither part of facediff nor registered."""
+    paths = {kind.kind: str(options.get(f"{kind.kind}.class_path")) for kind in COMPONENTS.values()}
+    classes = {name: find_class(COMPONENTS[name], path, object) for name, path in paths.items()}
+    own = {f"model.{name}": path for name, path in paths.items() if classes[name] and alias_path(classes[name]) == path}
+    return {option: path for option, path in {"model": model, **own}.items() if not path.startswith("facediff.")}
 
 
 def cost_of_test(cell: Cell, model: Mapping[str, Any], data: SpeechMotionDataModule) -> str:

@@ -27,6 +27,7 @@ from facediff.cli.configs import (
     change_values,
     check_config,
     class_of,
+    classes_in,
     keys_of,
     name_of,
     refuse_early,
@@ -230,25 +231,38 @@ def import_corpus(
     return None
 
 
-def import_model(arguments: Sequence[str]) -> str | None:
-    """Import the model's class that the user names by ``--model`` or in a config; it may be a file of this folder.
+def import_classes(arguments: Sequence[str]) -> list[tuple[str, str]]:
+    """Import the classes of the model and its components that the user names by flags or in a config.
 
-    Like a corpus's, it is never imported because a checkpoint names it. None if none is named.
+    They may be files of this folder. Like a corpus's, none is imported because a checkpoint names it.
+
+    Returns:
+        each option and its import path, such as ``("model.decoder", "my_decoder.Mine")``.
     """
     from facediff.cli.data import find_own_module
     from facediff.utils.hints import is_path
 
-    names = [value_of(arguments, "--model"), *map(class_of, config_files(arguments))]
-    model = next((name for name in names if is_path(name)), None)
-    if model is not None:
-        find_own_module(model)
+    named: list[tuple[str, str]] = []
+
+    def note(flag: str, value: str) -> str:
+        option = "" if flag in ("-c", "--config") else flag.lstrip("-")
+        named.extend(classes_in(option, value, Path.cwd()))
+        return value
+
+    change_values(arguments, note)
+    options = {"model", *(f"model.{kind}" for kind in registry.COMPONENTS)}
+    classes = [pair for pair in named if pair[0] in options and is_path(pair[1])]
+    for option, name in classes:
+        if name.startswith("facediff."):
+            continue
+        find_own_module(name)
         try:
-            importlib.import_module(model.rpartition(".")[0])
+            importlib.import_module(name.rpartition(".")[0])
         except Exception as error:  # a module can fail in any way while it is imported
             raise FaceDiffError(
-                f"--model {model}: cannot be imported ({import_failure(error)}); expected package.module.Class"
+                f"--{option} {name}: cannot be imported ({import_failure(error)}); expected package.module.Class"
             ) from error
-    return model
+    return classes
 
 
 def tell_folder(path: Path, options: Mapping[str, Any]) -> None:
@@ -347,14 +361,16 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     from facediff.models.base import build_model
     from facediff.models.checkpoint import corpus_of, read_checkpoint
 
-    model = import_model(arguments)
+    named = import_classes(arguments)
     checkpoint = read_checkpoint(path)
     build_model(path, checkpoint)  # reports a damaged checkpoint before Lightning starts
     if name == "fit":
         return []
     hparams = checkpoint["hyper_parameters"]
-    # The checkpoint's own class only permits the import of its code.
-    same = ("--model", f"--model={model}") if model == hparams["_class_path"] else ()
+    # The checkpoint's own classes only permit the import of their code.
+    own = {f"model.{kind}": hparams[kind]["class_path"] for kind in registry.COMPONENTS if hparams.get(kind)}
+    own["model"] = hparams["_class_path"]
+    same = [word for option, name in named if own.get(option) == name for word in (f"--{option}", f"--{option}={name}")]
     changes = [word for word in arguments if re.match(rf"--model(?!\.(init_args\.)?({'|'.join(FREE)})\b)\b", word)]
     changes = [word for word in changes if word not in same]
     if changes:

@@ -131,6 +131,28 @@ def test_predict_writes_files(checkpoint: Path, tmp_path: Path, monkeypatch: pyt
     assert np.load(files[0]).shape[1] == 72
 
 
+def test_a_component_of_the_working_folder_is_read_where_its_user_names_it(
+    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "my_decoder", raising=False)
+    code = "from facediff.models.decoders import GruDecoder\n\n\nclass Mine(GruDecoder):\n    pass\n"
+    (tmp_path / "my_decoder.py").write_text(code)
+    named = "--model.decoder=my_decoder.Mine"
+    assert fit(named, "--model.decoder.num_layers=1", "--name=mine") == 0
+    (path,) = tmp_path.glob("runs/mine/version_0/checkpoints/last.ckpt")
+    del sys.modules["my_decoder"]
+    with pytest.raises(FaceDiffError, match=f"add {named} to"):
+        words_of_checkpoint("test", path, [])
+    with pytest.raises(FaceDiffError, match="--model.decoder=gru"):
+        words_of_checkpoint("test", path, [named, "--model.decoder=gru"])
+    del sys.modules["my_decoder"]
+    assert main(["validate", f"--ckpt_path={path}", named, "--trainer.enable_progress_bar=false"]) == 0
+    written = yaml.safe_load((tmp_path / "runs/validate/version_0/config.yaml").read_text())
+    assert written["model"]["init_args"]["decoder"]["init_args"]["num_layers"] == 1
+
+
 @pytest.mark.slow
 def test_the_last_checkpoint_is_the_newest_runs(
     fitted: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
