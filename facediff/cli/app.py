@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "animate": Command("animate:animate", "animate a face with a recording of speech"),
     "live": Command("live:live", "animate live speech, and send it to engines and browsers"),
-    "person": Command("track:person", "make a model of a person from a video", "prepare,render"),
+    "person": Command("track:person", "make a model of a person from a video", "prepare,render,onnx"),
     "adapt": Command("adapt:adapt", "fine-tune a trained model on a new speaker, or on other voices"),
     "publish": Command("publish:publish", "write a trained model as a folder for others, or send it to the hub"),
     "export-model": Command(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from facediff.animation.styles import split_styles
-from facediff.errors import note
+from facediff.errors import needs_extra, note
 from facediff.speech.audio import SAMPLE_RATE, VIDEOS
 
 if TYPE_CHECKING:
@@ -37,8 +37,9 @@ def _motion(name: str, model: Callable[[], Any]) -> str:
 
 def video_style(video: Path, model: Any) -> Path:  # noqa: ANN401 - an Animator, which imports this file
     """A file with the motion of a video's first clip on the face of a model; it is kept for the next time."""
-    from facediff.data.preparation import write_mesh
-    from facediff.data.track.corpus import track_people
+    with needs_extra("torch", "prepare,render,onnx", "the style of a video"):
+        from facediff.data.preparation import write_mesh
+        from facediff.data.track.corpus import track_people
     from facediff.data.track.options import TrackingOptions
     from facediff.utils.arrays import ArrayStore
     from facediff.utils.checksums import sha256

@@ -18,6 +18,9 @@ ROOT = Path(__file__).parents[2]
 EXTRAS = {
     "demo -o demo": "train,puppet,render",
     "animate a.wav --checkpoint c.ckpt -o a.npz": "train",
+    "animate a.wav --style a.mp4 -o a.npz": "prepare,render,onnx",
+    "person a.mp4 -o b.ckpt": "prepare,render,onnx",
+    "data track a.mp4 -o people": "prepare,render,onnx",
     "live c.ckpt a.wav --to jsonl:-?weights=false": "train",
     "adapt --checkpoint c.ckpt --person p -o b.ckpt": "train",
     "publish c.ckpt published": "train",
@@ -87,7 +90,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, st
     soundfile.write(folder / "a.wav", np.zeros(16_000), 16_000)
     np.save(folder / "a.npy", np.zeros((10, 4, 3), np.float32))
     (folder / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 3 4\n")
-    for name in ("c.ckpt", "plan"):
+    for name in ("c.ckpt", "plan", "a.mp4"):
         (folder / name).write_text("x")
     for name in ("p", "t"):
         (folder / name).mkdir()
