@@ -21,7 +21,7 @@ import trimesh
 from facediff.animation import write_archive
 from facediff.editing.landmarks import NAMES
 from tests.fakes.chromium import Chromium, Page, find_chromium
-from tests.fakes.heads import lower_face, lower_face_marks, talking
+from tests.fakes.heads import lower_face, lower_face_marks, talking_second, turned
 
 
 def click(page: Page, side: str, vertex: int) -> None:
@@ -48,8 +48,8 @@ def main(words: list[str] | None = None) -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with tempfile.TemporaryDirectory() as name, Chromium(program) as browser:
         folder = Path(name)
-        write_archive(folder / "talking.npz", talking())
-        mask = trimesh.Trimesh(head.vertices, head.faces, process=False)
+        write_archive(folder / "talking.npz", talking_second())
+        mask = trimesh.Trimesh(head.vertices @ turned(20, 140, 0), head.faces, process=False)
         mask.export(folder / "mask.obj", include_normals=False)
         subprocess.run([*command, "-o", "plain.npz"], cwd=folder, env=environment, check=False)
         with subprocess.Popen(

@@ -94,7 +94,7 @@ def picking_page(picking: Picking) -> Iterator[str]:
     moved = run_alike(goal, Surface(target.vertices, target.faces.astype(np.int64)))
     faces = moved.faces if picking.face_triangles is None else moved.faces[picking.face_triangles]
     back, features, target_features = placed(goal, Surface(target.vertices, faces))
-    if features is not None and not _as_wide(features, target_features):
+    if features is not None and not _as_wide(features, target_features, back.apply(target.vertices)):
         # No mouth is where the alignment expects it: a person knows best how the mesh lies in its file.
         target_features, back = None, _as_in_its_file(rest, target.vertices, faces)
     laid = back.apply(target.vertices)
@@ -141,8 +141,11 @@ def _runs(parts: Sequence[MeshPart]) -> list[tuple[str, list[tuple[int, int]]]]:
 ALIKE = 0.4, 2.5  # widths of the mouth of a mesh that is laid well, in the source's
 
 
-def _as_wide(features: Features, target: Features | None) -> bool:
-    return target is not None and ALIKE[0] < target.mouth.width / features.mouth.width < ALIKE[1]
+def _as_wide(features: Features, target: Features | None, laid: Array) -> bool:
+    # Where it lies now: the alignment may have shrunk the mesh after its mouth was found.
+    return target is not None and (
+        ALIKE[0] < np.ptp(laid[target.mouth.upper_seeds], axis=0).max() / features.mouth.width < ALIKE[1]
+    )
 
 
 def _as_in_its_file(rest: Array, points: Array, faces: npt.NDArray[np.integer]) -> Similarity:

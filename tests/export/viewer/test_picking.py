@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 import urllib.error
 import urllib.request
@@ -19,7 +20,7 @@ from facediff.export.viewer.picking import MOST_BYTES, Picking, make_app, pickin
 from facediff.mesh import Mesh
 from facediff.utils.server import LOOPBACK, names_of
 from tests.fakes.chromium import Chromium, Page
-from tests.fakes.heads import LONG, nearest_vertices, talking
+from tests.fakes.heads import LONG, lower_face, nearest_vertices, talking, talking_second
 from tests.fakes.serving import servers
 from tests.fakes.small_face import LANDMARKS, build_face, build_rig
 
@@ -142,6 +143,15 @@ def test_other_pages_other_bodies_and_other_paths_are_refused(serve: Serve, pick
         assert response.headers["Server"] is None
     assert names_of("0.0.0.0") is None  # noqa: S104
     assert "10.0.0.7" in (names_of("10.0.0.7") or ())
+
+
+def test_a_mesh_that_the_alignment_has_shrunk_is_shown_as_in_its_file(tmp_path: Path) -> None:
+    """Its mouth was found in its place, and then the alignment made a dot of 5 mm of it."""
+    head, source = lower_face(), talking_second()
+    mask = Mesh(head.vertices, head.faces.astype(np.int32))
+    page = "".join(picking_page(Picking(source, mask, ("a", "b"), tmp_path / "map.json")))
+    *_, extent = re.findall(r'"whole": ?\{.*?"extent": ?\[([^]]*)\]', page)  # of the target
+    assert max(map(float, extent.split(","))) > 500 * np.ptp(source.template, axis=0).max() * 0.9
 
 
 # In a browser.
