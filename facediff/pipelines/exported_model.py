@@ -55,9 +55,9 @@ class ExportedModel(AnimationModel):
         """Animate frame by frame from now on."""
         self.runtime.choose_low_latency()
 
-    def choose_expressivity(self, expressivity: Expressivity) -> None:
+    def choose_expressivity(self, factor: Expressivity) -> None:
         """Go from the mean prediction (0) to a full sample (1) or beyond."""
-        self.expressivity = expressivity
+        self.expressivity = factor
 
     def default_style(self, identity: str) -> Reference | Style:
         """The folder's style of an identity."""
