@@ -1,7 +1,7 @@
 r"""Make the model that comes with facediff, ``facediff/bundled/puppet``, out of a trained checkpoint.
 
 The recipe, where flite is installed, in three hours and a half on two cores. READERS
-are 185 people of LibriSpeech with up to two recordings each; the first 32 epochs heard 121 of them, by version 3bae1a2b.
+are 185 people of LibriSpeech with up to two recordings each; the first 32 epochs heard 121 of them (version 3bae1a2b).
 
     $ facediff data align LibriSpeech -o READERS
     $ FIT="facediff fit --config configs/experiment/puppet_quality.yaml --model.motion_space.lips_weight=3.5 \
