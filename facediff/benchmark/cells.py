@@ -92,12 +92,12 @@ def hash_of(content: object) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def with_code(content: dict[str, Any]) -> dict[str, Any]:
+def with_code(content: Mapping[str, Any]) -> dict[str, Any]:
     """Plain data, with the SHA-256 of the working folder's modules and packages that its class paths name."""
     values = re.findall(r'"([A-Za-z_]\w*)\.[\w.]+\\?"(?!:)', json.dumps(content, default=str))
     files = [file for name in {*values} - {"facediff"} for file in (Path(f"{name}.py"), *Path(name).rglob("*.py"))]
     code = {file.as_posix(): sha256(file) for file in files if file.is_file()}
-    return {**content, "code": code} if code else content
+    return {**content, **({"code": code} if code else {})}
 
 
 @dataclass(frozen=True)

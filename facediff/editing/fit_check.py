@@ -171,7 +171,7 @@ def _torn(
 
 def _apart(animation: Animation, pairs: Integers, frame: int) -> Array:
     """From one lip to the other at rest and in a frame, (2, P, 3)."""
-    frames = np.float64([animation.template, animation.vertices[frame]])
+    frames = np.stack([animation.template, animation.vertices[frame]]).astype(np.float64)
     return np.asarray(frames[:, pairs[:, 0]] - frames[:, pairs[:, 1]])
 
 
