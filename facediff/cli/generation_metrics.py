@@ -133,7 +133,7 @@ def corpus_of_checkpoint(
 
     options: dict[str, Any]
     if is_graphs(checkpoint):
-        find_own_module(corpus or "")
+        find_own_module(corpus)
         module = by_name(corpus or read_folder(checkpoint)[0].corpus, None)
         options = {} if data_root is None else {"root": str(data_root)}
     else:

@@ -93,7 +93,8 @@ def check_fit(animation: Animation, carried: Animation, correspondence: Correspo
         elif opening * metres_per_unit(animation.unit) > SPEAKS and target is not None:
             facing = target.lips(correspondence.laid.vertices, LIPS)
             # Along the way that the lips part: facing vertices of a coarse mesh do not lie above one another.
-            parting = _apart(animation, pairs, widest)[1] - _apart(animation, pairs, widest)[0]
+            shut, wide = _apart(animation, pairs, widest)
+            parting = wide - shut
             way = parting.mean(axis=0) / np.linalg.norm(parting.mean(axis=0))
             gaps = _apart(carried, facing, widest) @ (rotation @ way)
             lips = {

@@ -25,7 +25,7 @@ from facediff.data.articulation import MouthMotion, articulation, mouth_motion
 from facediff.data.batch import UNKNOWN_IDENTITY
 from facediff.data.corpus import LIP_TEETH_PAIRS
 from facediff.data.dataset import MotionDataset
-from facediff.errors import FaceDiffError, counted
+from facediff.errors import FaceDiffError
 from facediff.metrics import (
     MeanVertexError,
     RealTimeFactor,
@@ -36,7 +36,6 @@ from facediff.metrics import (
 from facediff.models.base import AnimationModel
 from facediff.models.evaluation import with_usual_styles
 from facediff.models.scoring import ScoredCorpus
-from facediff.registry import name_of
 from facediff.spaces.space import METRES
 from facediff.speech.phonemes import phonemes_file, read_phonemes
 from facediff.utils import ranges
@@ -494,8 +493,7 @@ def sampler_of(model: AnimationModel) -> str:
     sampler = getattr(model, "sampler", None)
     if sampler is None:
         return type(model).__name__
-    is_text = isinstance(sampler, str)  # of graphs
-    description = sampler if is_text else f"{name_of(type(sampler))} with {counted(sampler.steps, 'step')}"
+    description = str(sampler)
     expressivity = model.expressivity
     if isinstance(expressivity, Tensor):
         return f"{description}, expressivity by vertex"

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from facediff.errors import ArgumentError, check_known
+from facediff.errors import ArgumentError, check_known, counted
 from facediff.models.layers import Share
-from facediff.registry import sampler
+from facediff.registry import name_of, sampler
 from facediff.utils.ranges import Range
 
 Steps = Annotated[int, Range(1, 100_000)]
@@ -258,6 +258,10 @@ class Sampler(ABC):
         self.spread = spread
         self.timesteps = visited(process, steps, spacing, last_noise, first_noise)
         self.signal = [*(float(process.signal[n]) for n in self.timesteps), 1.0]
+
+    def __str__(self) -> str:
+        """Its registered name and its steps."""
+        return f"{name_of(type(self))} with {counted(self.steps, 'step')}"
 
     def run(
         self,

@@ -31,8 +31,8 @@ class ExportedPipeline(AnimationPipeline):
         self.model = copy(RuntimeModel.open(options.checkpoint, threads=options.threads) if model is None else model)
         about = self.model.description
         self.corpus = f"the exported model's corpus {about.corpus}"
-        if options.commercial_only and about.licences.get("commercial_use") != "allowed":
-            raise OptionError("commercial_only", f"{about.model} is not cleared for commercial use; omit the option")
+        if options.commercial_only:
+            about.require_commercial_use()
         if options.low_latency:
             self.model.choose_low_latency()
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ from torch import Tensor
 
 from facediff.data import Batch
 from facediff.data.batch import Assets, Reference
-from facediff.errors import OptionError
+from facediff.errors import counted
 from facediff.models.base import AnimationModel
 from facediff.models.inference import Expressivity, Style
 from facediff.runtime.model import RuntimeModel, RuntimeStream
 from facediff.runtime.sampling import RuntimeChoices, RuntimeConditions
+from facediff.runtime.styles import style_from
+from facediff.speech.windows import WindowPlan
 
 
 class ExportedModel(AnimationModel):
@@ -29,8 +32,8 @@ class ExportedModel(AnimationModel):
     def open(cls, folder: Path, assets: Assets, *, commercial_only: bool = False) -> ExportedModel:
         """Read a folder for the clips of a corpus, whose speakers need not be those of the training."""
         runtime = RuntimeModel.open(folder)
-        if commercial_only and runtime.description.licences.get("commercial_use") != "allowed":
-            raise OptionError("commercial_only", f"{folder} is not cleared for commercial use; omit the option")
+        if commercial_only:
+            runtime.description.require_commercial_use()
         return cls.of(runtime, assets)
 
     @classmethod
@@ -43,7 +46,8 @@ class ExportedModel(AnimationModel):
         )
         model.runtime = runtime
         model.samples = about.generation == "sampled"  # type: ignore[misc]  # of each folder
-        model.sampler = f"{about.sampler} with {len(runtime.loop)} steps"
+        model.sampler = f"{about.sampler} with {counted(len(runtime.loop), 'step')}"
+        model.windows = WindowPlan(above=math.inf)  # the folder's own plan cuts speech
         model.adopt(assets)
         return model.eval()
 
@@ -57,15 +61,16 @@ class ExportedModel(AnimationModel):
 
     def choose_expressivity(self, factor: Expressivity) -> None:
         """Go from the mean prediction (0) to a full sample (1) or beyond."""
+        if self.runtime.description.last_step < 0:
+            super().choose_expressivity(factor)  # refuses all but 1
         self.expressivity = factor
 
     def default_style(self, identity: str) -> Reference | Style:
         """The folder's style of an identity."""
         about = self.runtime.description
-        styles = about.styles
-        if about.style_source != "reference" or identity not in styles:
+        if about.style_source != "reference" or identity not in about.styles:
             return super().default_style(identity)
-        return Style(identity, torch.from_numpy(np.float32(self.runtime.arrays["styles"][styles.index(identity)])))
+        return Style(identity, torch.from_numpy(style_from(identity, self.runtime, identity).vector))
 
     def encode_style(self, reference: Tensor, mask: Tensor) -> Tensor:
         """Style vectors of reference motions by the folder's graph."""
@@ -96,10 +101,6 @@ class ExportedModel(AnimationModel):
             motion[clip, :frames] = torch.from_numpy(points) - batch.template[clip]
         return motion
 
-    def sample_clip(self, clip: Batch, seeds: Sequence[int], *, progress: Any = None) -> Tensor:  # noqa: ANN401, ARG002
+    def generate_samples(self, clip: Batch, seeds: Sequence[int], *, progress: Any = None) -> Tensor:  # noqa: ANN401, ARG002
         """Samples (seeds, T, points, dims) of one clip of any length."""
         return torch.cat([self.generate_clips(clip, seed=seed) for seed in seeds])
-
-    def generate(self, batch: Batch, *, seed: int = 0, **_: Any) -> Tensor:  # noqa: ANN401
-        """Motion of clips of any length, each by windows where it is long."""
-        return self.generate_clips(batch, seed=seed)

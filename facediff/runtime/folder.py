@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from facediff.errors import FaceDiffError, damaged
+from facediff.errors import FaceDiffError, OptionError, damaged
 from facediff.runtime.graph_check import REMEDY
 from facediff.spaces import VERTICES, Space
 from facediff.spaces.decoding import ChannelDecoder
@@ -94,6 +94,11 @@ class Description:
     def content(self) -> dict[str, Any]:
         """The JSON object that is written."""
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
+
+    def require_commercial_use(self) -> None:
+        """Refuse a model that is not cleared for commercial use."""
+        if self.licences.get("commercial_use") != "allowed":
+            raise OptionError("commercial_only", f"{self.model} is not cleared for commercial use; omit the option")
 
     @property
     def known(self) -> list[str]:

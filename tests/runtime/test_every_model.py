@@ -215,9 +215,12 @@ def test_exported_folder_gives_what_the_model_gives(
 
 
 def test_direct_model_has_no_samples_around_a_mean(tiny_root: Path) -> None:
-    runtime = in_eager(ready("style content", tiny_root, {}))
+    model = ready("style content", tiny_root, {})
+    runtime = in_eager(model)
     with pytest.raises(FaceDiffError, match="expressivity"):
         runtime.animate(sound(1.0), expressivity=0.5)
+    with pytest.raises(FaceDiffError, match="expressivity"):
+        ExportedModel.of(runtime, model.assets).choose_expressivity(0.5)
 
 
 class Branching(torch.nn.Module):

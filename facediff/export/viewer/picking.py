@@ -94,10 +94,10 @@ def picking_page(picking: Picking) -> Iterator[str]:
     moved = run_alike(goal, Surface(target.vertices, target.faces.astype(np.int64)))
     faces = moved.faces if picking.face_triangles is None else moved.faces[picking.face_triangles]
     back, features, target_features = placed(goal, Surface(target.vertices, faces))
-    if features is not None and not _as_wide(features, target_features, back.apply(target.vertices)):
-        # No mouth is where the alignment expects it: a person knows best how the mesh lies in its file.
-        target_features, back = None, _as_in_its_file(rest, target.vertices, faces)
     laid = back.apply(target.vertices)
+    if features is not None and not _as_wide(features, target_features, laid):
+        # No mouth is where the alignment expects it: a person knows best how the mesh lies in its file.
+        target_features, laid = None, _as_in_its_file(rest, target.vertices, faces).apply(target.vertices)
     source_landmarks = known_landmarks(rest, goal.faces)
     of_target = known_topology(target.vertices)
     suggested = (
