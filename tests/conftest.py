@@ -15,6 +15,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["WANDB_MODE"] = "offline"
 os.environ["WANDB_SILENT"] = "true"
 os.environ["FACEDIFF_TRACEBACK"] = "1"  # unexpected errors fail a test as what they are
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # also of commands that tests start: the other core has tests of its own
 
 # Where no bytecode is to be written, as in many containers, all tests would be compiled anew each time, and the package
 # by each of the hundreds of processes that they start. Nobody means this folder, which git ignores, by that.

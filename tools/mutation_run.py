@@ -295,7 +295,8 @@ class Workshop:
         path.write_bytes(mutant.applied(source))
         for part in filter(None, parts):
             status = forked(partial(work, part), LIMIT + 10 * sum(self.tests[name].seconds for name in part))
-            if status in (pytest.ExitCode.NO_TESTS_COLLECTED, pytest.ExitCode.USAGE_ERROR):
+            # A mutant that cannot even be imported by a conftest is a usage error to pytest, and killed.
+            if status == pytest.ExitCode.NO_TESTS_COLLECTED:
                 raise RuntimeError(f"the tests could not be run:\n{(self.folder / 'pytest.log').read_text()[-3000:]}")
             outcome.result = "survived" if status == pytest.ExitCode.OK else "killed"
             if outcome.result == "killed":

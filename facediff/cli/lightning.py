@@ -115,8 +115,7 @@ def run_cli(name: str, arguments: Sequence[str]) -> FaceDiffCLI:
 
     from facediff.cli.lightning_cli import run_lightning_cli
 
-    if name == "fit":
-        keep_freed_memory()
+    keep_freed_memory()
     load_components()
     with exit_statuses():
         return run_lightning_cli(name, options, experiment_name(options) or name)

@@ -96,6 +96,7 @@ def test_gradient_norm_is_without_the_scale_of_mixed_precision(make_trainer: Mak
     assert scaler.get_scale() == 1024.0
 
 
+@pytest.mark.slow
 def test_gradient_norm_of_two_processes_is_that_of_the_mean(make_trainer: MakeTrainer, tmp_path: Path) -> None:
     # The first step sees 1 and 3 on the two processes, the second 2 and 8.
     # A fork of this process would wait for ever for locks that threads of earlier tests may hold.

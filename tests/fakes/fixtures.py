@@ -16,6 +16,7 @@ import lightning.pytorch as pl
 import pytest
 import torch
 
+from facediff.cli.lightning import keep_freed_memory
 from facediff.models import DualPathDiffusion
 from facediff.runtime.onnxruntime_web import VERSION
 from tests.fakes.chromium import Chromium, find_chromium
@@ -24,6 +25,7 @@ from tests.fakes.tiny import Tiny, tiny_model_options, write_tiny
 
 # Tiny tensors are faster on one thread, and much faster where something else keeps the other cores busy.
 torch.set_num_threads(1)
+keep_freed_memory()
 parse_imports_once()
 
 

@@ -166,14 +166,14 @@ def test_wrong_things_meet_one_sentence_in_the_words_of_python(
 
 
 def test_stream_is_the_recording_by_windows_however_it_is_cut(model: facediff.Animator, tmp_path: Path) -> None:
-    bursts = np.sin(np.arange(16000 * 3) * 2 * np.pi * 3 / 16000) > 0  # a steady sound is no speech
-    samples = (0.1 * bursts * np.random.default_rng(0).normal(size=16000 * 3)).astype(np.float32)
-    model.module.windows = type(model.module.windows)(seconds=1, overlap=0.25, above=2)
+    bursts = np.sin(np.arange(16000 * 2) * 2 * np.pi * 3 / 16000) > 0  # a steady sound is no speech
+    samples = (0.1 * bursts * np.random.default_rng(0).normal(size=16000 * 2)).astype(np.float32)
+    model.module.windows = type(model.module.windows)(seconds=1, overlap=0.25, above=1)
     options = {"identity": "M2", "style": "F1_e03", "seed": 4, "steps": 3, "expressiveness": {"lips": 1.4}}
     whole = model.animate(samples, 16000, **options).vertices
     plain = model.animate(samples, 16000, **{**options, "expressiveness": None}).vertices
     assert np.ptp(whole, axis=0).max() > 1.1 * np.ptp(plain, axis=0).max()
-    for chunks in ([samples], np.array_split(samples, 70), [samples[:0], torch.from_numpy(samples)]):
+    for chunks in ([samples], np.array_split(samples, 20), [samples[:0], torch.from_numpy(samples)]):
         parts = []
         for frames in model.stream(chunks, **options):
             assert frames.dtype == np.float32
@@ -184,7 +184,7 @@ def test_stream_is_the_recording_by_windows_however_it_is_cut(model: facediff.An
     # Bytes at another rate are what the command's standard input is.
     pcm = (samples * 32767).astype("<i2").tobytes()
     made = np.concatenate([*model.stream([pcm[:4000], pcm[4000:]], 24000, seed=4)])
-    assert made.shape == (50, 5875, 3)
+    assert made.shape == (33, 5875, 3)
     assert list(model.stream([])) == []
 
 

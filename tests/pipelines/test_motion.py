@@ -162,18 +162,10 @@ def test_other_meshes_and_weights_are_those_of_the_commands(model: facediff.Anim
     np.testing.assert_array_equal(made.vertices, carried.vertices)
     face = trimesh.load("face.ply", process=False)
     face.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])).export("z_up.ply")
-    upright = model.animate("speech.wav", identity="F1", target_mesh="z_up.ply")
+    upright = model.animate("speech.wav", identity="F1", target_mesh="z_up.ply", correspondence="z.npz")
     assert np.abs(upright.vertices - carried.vertices).max() < 1e-5
-    words = [
-        "animate",
-        "speech.wav",
-        "--checkpoint",
-        "demo/puppet.ckpt",
-        "--identity",
-        "F1",
-        "--target-mesh",
-        "z_up.ply",
-    ]
+    words = ["animate", "speech.wav", "--checkpoint", "demo/puppet.ckpt", "--identity", "F1"]
+    words += ["--target-mesh", "z_up.ply", "--correspondence", "z.npz"]
     command(*words, "-o", "own.pc2")
     assert " z up" in Path("own.obj").read_text().splitlines()[0], "a point cache fits its mesh"
     command(*words, "-o", "turned.pc2", "--up", "y")

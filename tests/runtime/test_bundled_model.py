@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 
 import facediff
 from facediff.animation.options import AnimationOptions
@@ -39,8 +40,11 @@ def test_a_recording_becomes_a_page_without_a_checkpoint_and_without_pytorch(tmp
 def test_the_face_lives_in_what_is_looked_at_and_not_in_numbers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    speech = tmp_path / "speech.wav"
+    soundfile.write(speech, read_speech(SPEECH)[:24_000], 16_000)
+
     def said(name: str, *words: str) -> str:
-        assert main(["animate", str(SPEECH), "-o", str(tmp_path / name), *words]) == 0
+        assert main(["animate", str(speech), "-o", str(tmp_path / name), *words]) == 0
         return capsys.readouterr().out
 
     unasked = said("alive.html")
@@ -53,9 +57,9 @@ def test_the_face_lives_in_what_is_looked_at_and_not_in_numbers(
     assert "procedural" not in still
     plain = said("plain.npz")
     assert "procedural" not in plain
-    motion = facediff.load().animate(SPEECH)
+    motion = facediff.load().animate(speech)
     assert np.array_equal(facediff.read(tmp_path / "plain.npz").vertices, motion.vertices)
-    assert main(["animate", str(SPEECH), "-o", str(tmp_path / "x.npz"), "--still"]) == 2
+    assert main(["animate", str(speech), "-o", str(tmp_path / "x.npz"), "--still"]) == 2
     assert "is for videos, pages and avatars" in capsys.readouterr().err
 
 

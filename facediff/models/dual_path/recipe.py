@@ -13,6 +13,7 @@ from typing import Any, cast
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
 from facediff import registry
 from facediff.data import Batch, Reference, SpeechMotionDataModule, collate
@@ -333,9 +334,8 @@ class DualPathRecipe(AnimationModel):
         if speech_style is None:
             return {}
         speech_style.forget()
-        dataset = data.dataset("train")
-        for index in range(len(dataset)):
-            batch = collate([dataset[index]]).to(self.device)
+        for batch in DataLoader(data.dataset("train"), batch_size=8, collate_fn=collate):
+            batch = batch.to(self.device)
             features = network.audio_encoder(batch.audio, batch.audio_lengths, batch.frame_lengths)
             style = network.dynamic_style(self.scaled(batch.motion), batch.mask)
             speech_style.update(features, batch.mask, style, batch.identity, memory=1.0)
