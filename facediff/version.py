@@ -1,3 +1,3 @@
 """The version of the package, in a file of its own so that every package may read it."""
 
-__version__ = "1.1.0"
+__version__ = "2.0.0"

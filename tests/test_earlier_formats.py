@@ -29,6 +29,9 @@ WRITTEN = [
     ("1.1", "tiny.ckpt", "A_e01", "energy"),
     ("1.1", "folder", "A_e01", "energy"),
     ("1.1", "exported", "A", "energy"),
+    ("2.0", "tiny.ckpt", "A_e01", "energy"),
+    ("2.0", "folder", "A_e01", "energy"),
+    ("2.0", "exported", "A", "energy"),
 ]
 
 
