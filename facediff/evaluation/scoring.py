@@ -35,6 +35,8 @@ from facediff.utils.limits import COORDINATE, in_range
 from facediff.utils.workers import WorkerDied
 
 METRICS = "metrics"  # Stands in place of a protocol's name where metrics were chosen by name
+UNLIKE = 3.0
+"""Times that no two faces differ in size by: they are in two units, or one side holds offsets."""
 NATIVE = (np.float16, np.float32, np.float64)  # Types that torch reads as they are
 
 
@@ -193,6 +195,13 @@ class Scorer:
             inputs = self.inputs(pair) if self.further else {}
         except FaceDiffError as error:
             return str(error)
+        for condition, prediction in predictions.items():
+            size = times_as_large(prediction, truth)
+            if not 1 / UNLIKE < size < UNLIKE:
+                return (
+                    f"{pair.predictions[condition]}: its face is {size:.3g} times as large as the truth's; "
+                    "expected whole faces, not offsets, in the truth's unit"
+                )
         scored = [
             self._score(pair.predictions[condition].stem, prediction, truth, template)
             for condition, prediction in predictions.items()
@@ -301,6 +310,14 @@ class Scorer:
                 clips.check_finite()
         remaining = metrics.keys() - by_source.keys()
         return by_source | {source: float(metrics[source].clip_value(clip)) for source in remaining}
+
+
+def times_as_large(prediction: Motion, truth: Motion) -> float:
+    """How large a prediction's face is for the truth's, by their first frames; 1 where a side has no extent to tell."""
+    if prediction.vertices is None or truth.vertices is None:
+        return 1.0
+    first, second = (float((face[0].amax(0) - face[0].amin(0)).norm()) for face in (prediction.vertices, truth.vertices))
+    return first / second if math.isfinite(first) and second > 0 and math.isfinite(second) else 1.0
 
 
 def read_vertices(path: Path, n_vertices: int, stride: int = 1) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,8 @@ def test_clips_without_a_value_are_left_out(corpus: Files) -> None:
 
 def test_a_clip_of_which_one_method_has_no_value_is_not_compared(corpus: Files) -> None:
     path = next(corpus.method("theirs").glob("A_e03*"))
-    np.save(path, np.zeros_like(np.load(path)))  # a mouth that does not move is neither early nor late
+    motion = np.load(path)
+    np.save(path, np.broadcast_to(motion[:1], motion.shape))  # a mouth that does not move is neither early nor late
     metric = "temporal_misalignment:smoothing=0"
     report = corpus.evaluate("ours", "theirs", metrics=[metric], corpus=corpus.root, protocols=["meshtalk"])
     rows = {(row["method"], row["clip"]): row[f"metrics/{metric}"] for row in report.rows()}
@@ -161,6 +163,15 @@ def test_a_clip_of_which_one_method_has_no_value_is_not_compared(corpus: Files) 
     assert (found.difference, found.sequences) == (pytest.approx(np.mean(gaps)), len(clips))
     (line,) = [line for line in text(report).splitlines() if f"theirs − ours: {metric}" in line]
     assert line.split()[-1] == str(len(clips))
+
+
+@pytest.mark.parametrize("change", [lambda motion: 1000 * motion, lambda motion: 0.01 * motion], ids=["mm", "offsets"])
+def test_predictions_in_another_unit_are_not_scored(corpus: Files, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    path = next(corpus.method("theirs").glob("A_e03*"))
+    np.save(path, change(np.load(path)))
+    report = corpus.evaluate("theirs")
+    assert f"{path}: its face is" in text(report)
+    assert "A_e03" not in {row["clip"] for row in report.rows() if row["paper/lve"] is not None}
 
 
 class PlainError(Metric):

@@ -134,7 +134,7 @@ def summarise(recording: Recording, model: FaceModel, sample_size: int) -> Recor
     if count < 2 or recording.missed > MOST_MISSED * count:
         raise FaceDiffError(
             f"{source}: shows no face in {recording.missed} of {count} frames; expected a face in at least 80 % of "
-            f"them, of 50 pixels or --min-face, seen from the front"
+            f"them, of at least 50 pixels (--min-face of data track), seen from the front"
         )
     blocks = list(recording.posed(model))
     scales, centres, angles = (

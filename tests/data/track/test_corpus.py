@@ -170,7 +170,7 @@ def test_noise_of_the_brows_is_a_warning(
 
 def test_a_video_becomes_a_speaker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    write_coded_video(tmp_path / "eva.mp4", pictures(talking(10)))
+    write_coded_video(tmp_path / "eva.mp4", pictures(talking(6)))
     words = ["person", "eva.mp4", "-o", "eva.ckpt", "--clip-seconds", "2", "--quiet", "--steps"]
     assert main([*words, "2"]) == 0
     model = facediff.load("eva.ckpt")
