@@ -316,7 +316,9 @@ def times_as_large(prediction: Motion, truth: Motion) -> float:
     """How large a prediction's face is for the truth's, by their first frames; 1 where a side has no extent to tell."""
     if prediction.vertices is None or truth.vertices is None:
         return 1.0
-    first, second = (float((face[0].amax(0) - face[0].amin(0)).norm()) for face in (prediction.vertices, truth.vertices))
+    first, second = (
+        float((face[0].amax(0) - face[0].amin(0)).norm()) for face in (prediction.vertices, truth.vertices)
+    )
     return first / second if math.isfinite(first) and second > 0 and math.isfinite(second) else 1.0
 
 
