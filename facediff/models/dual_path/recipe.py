@@ -174,8 +174,8 @@ class DualPathRecipe(AnimationModel):
         shapes = super().measure(data, PRINCIPAL if self.options.noise_scale == "auto" else at_least)
         space, covariance = self.motion_space, None
         if space.prior_frames > 1 and isinstance(space, ComponentMotion):
-            project = space.components.project
-            covariance = data.covariance_over_time(lambda motion: project(motion * self.scale), space.prior_frames)
+            project = space.components.projection(float(self.scale))
+            covariance = data.covariance_over_time(project, space.prior_frames)
         if self.options.noise_scale == "auto" and shapes is not None:
             # Shapes are as long as their standard deviations, so their squared lengths are the components' variances.
             variances = shapes[:PRINCIPAL].square().sum(1)
