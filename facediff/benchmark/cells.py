@@ -8,8 +8,10 @@ concerns, and finds the results of all others.
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import re
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -93,11 +95,23 @@ def hash_of(content: object) -> str:
 
 
 def with_code(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data, with the SHA-256 of the working folder's modules and packages that its class paths name."""
-    values = re.findall(r'"([A-Za-z_]\w*)\.[\w.]+\\?"(?!:)', json.dumps(content, default=str))
-    files = [file for name in {*values} - {"facediff"} for file in (Path(f"{name}.py"), *Path(name).rglob("*.py"))]
-    code = {file.as_posix(): sha256(file) for file in files if file.is_file()}
+    """Plain data, with the SHA-256 of the researcher's own modules and packages that its class paths name."""
+    code: dict[str, str] = {}
+    for name in {*re.findall(r'"([A-Za-z_]\w*)\.[\w.]+\\?"(?!:)', json.dumps(content, default=str))} - {"facediff"}:
+        if (folder := own_code(name)) is not None:
+            files = [folder / f"{name}.py", *(folder / name).rglob("*.py")]
+            code |= {file.relative_to(folder).as_posix(): sha256(file) for file in files if file.is_file()}
     return {**content, **({"code": code} if code else {})}
+
+
+def own_code(module: str) -> Path | None:
+    """Where a module lies that is edited in place: the working folder, or that of an editable installation."""
+    if Path(f"{module}.py").is_file() or Path(module).is_dir():
+        return Path()
+    spec = None if module in sys.stdlib_module_names else importlib.util.find_spec(module)
+    if spec is None or spec.origin is None or "-packages" in spec.origin:
+        return None
+    return Path(spec.origin).parents[spec.submodule_search_locations is not None]
 
 
 @dataclass(frozen=True)

@@ -91,18 +91,21 @@ def test_a_changed_config_runs_its_own_cells_again_and_those_alone(folder: Path)
     assert {cell.seed for cell in run(folder)} == {2}
 
 
-def test_changed_code_of_the_working_folder_runs_its_own_cells_again(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("place", ["", "installed in place"])
+def test_changed_code_of_ones_own_runs_its_own_cells_again(
+    folder: Path, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder / place)
     (folder / "plan.yaml").write_text(ONE_SEED)
     (folder / "two.yaml").write_text("model: {class_path: mine.model.Mine}\n")
-    (folder / "mine").mkdir()
-    (folder / "mine" / "parts.py").write_text("WIDTH = 1")
+    (folder / place / "mine").mkdir(parents=True)
+    (folder / place / "mine" / "__init__.py").touch()
+    (folder / place / "mine" / "parts.py").write_text("WIDTH = 1")
     run(folder)
     assert run(folder) == []
     cells = cells_of(read_plan(folder / "plan.yaml"))
-    (folder / "mine" / "parts.py").write_text("WIDTH = 2")
+    (folder / place / "mine" / "parts.py").write_text("WIDTH = 2")
     problems = [outcome.problem for _, outcome in run_cells(cells, setting(folder), workers=1)]
     assert [bool(problem) for problem in problems] == [False, False]  # they are trained
     assert {cell.row for cell in run(folder)} == {"two"}
