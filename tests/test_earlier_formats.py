@@ -18,20 +18,10 @@ from tests.fakes.tiny import Tiny
 
 ROOT = Path(__file__).parents[1]
 RECORDING = ROOT / "docs" / "examples" / "question.wav"
+STYLES = {"tiny.ckpt": "A_e01", "folder": "A_e01", "exported": "A"}  # an exported folder keeps one for each identity
 WRITTEN = [
     ("0.1", "tiny.ckpt", "A_e01", "off"),  # which had no voice gate
-    ("0.2", "tiny.ckpt", "A_e01", "energy"),
-    ("0.2", "folder", "A_e01", "energy"),
-    ("0.2", "exported", "A", "energy"),  # which keeps a style for each identity
-    ("1.0", "tiny.ckpt", "A_e01", "energy"),
-    ("1.0", "folder", "A_e01", "energy"),
-    ("1.0", "exported", "A", "energy"),
-    ("1.1", "tiny.ckpt", "A_e01", "energy"),
-    ("1.1", "folder", "A_e01", "energy"),
-    ("1.1", "exported", "A", "energy"),
-    ("2.0", "tiny.ckpt", "A_e01", "energy"),
-    ("2.0", "folder", "A_e01", "energy"),
-    ("2.0", "exported", "A", "energy"),
+    *((version, *kind, "energy") for version in ("0.2", "1.0", "1.1", "2.0") for kind in STYLES.items()),
 ]
 
 

@@ -41,6 +41,7 @@ def test_centres_are_a_fixed_point_of_lloyd_and_do_not_depend_on_the_order() -> 
     assert torch.equal(cluster_centres(frames.flip(0), 7, seed=0), centres)
     assert not torch.equal(cluster_centres(frames, 7, seed=1), centres)
     assert len(cluster_centres(frames[:1].expand(9, 3), 4, seed=0)) == 1
+    assert cluster_centres(torch.tensor([[0.0], [3.0], [3.0]]).double(), 1, seed=0).item() == 2
 
 
 def test_entropy_of_clusters_that_lie_apart() -> None:

@@ -73,6 +73,7 @@ def test_the_ratio_is_one_of_sums_and_the_rate_one_of_minutes() -> None:
     offsets = predictions - face(torch.ones(1))
     neutral = face(torch.ones(1))[0]
     metric = fm.BlinkRate(LIDS, frames_per_second=20)
+    assert metric.definition.startswith("blinks of the prediction over minutes at 20 frames a second")
     metric.update(offsets, offsets, offsets_from=neutral)
     assert metric.compute().item() == pytest.approx(6.0)
     with pytest.raises(ValueError, match="frames_per_second"):
@@ -99,3 +100,8 @@ def test_lids_that_wander_have_the_variance_of_blinks_and_drift() -> None:
     assert found > 5
     assert fm.motion_liveliness(made, true).item() == pytest.approx(1, abs=0.1)
     assert fm.eyelid_drift(face(torch.zeros(20)), true[:20], LIDS).item() == 0  # shut throughout
+    both = fm.EyelidDrift(LIDS)
+    for frames in (100, 400):
+        both.update(made[None, :frames], true[None, :frames])
+    sums = [100 * drift(each[:100]) + 400 * drift(each) for each in (wandering, resting)]
+    assert both.compute().item() == pytest.approx(sums[0] / sums[1])

@@ -262,6 +262,11 @@ def test_speech_is_decoded_with_another_clips_style_unless_told_otherwise(tiny: 
     assert torch.equal(styles[3], model.style_of_window(batch, batch.motion * SCALE))
 
 
+def test_contents_that_never_change_are_no_distance_apart() -> None:
+    still = torch.ones(1, 4, 3)
+    assert relative_distance(still, still, torch.ones(1, 4, dtype=torch.bool)) == 0
+
+
 def test_what_comes_back_from_a_swap_follows_what_went_in(tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     """No gradient goes through the content and the style that swapped motion is to give back."""
     from facediff.models.style_content import model as module
