@@ -36,6 +36,10 @@ def test_the_nearest_speaker_is_that_of_the_documented_distance() -> None:
         metric = fm.NearestSpeakerAccuracy(known, components=components, shrinkage=shrinkage)
         metric.update(torch.from_numpy(clips), nearest.tolist())
         assert metric.compute().item() == 1.0
+        small = fm.SpeakerGallery(1e-6 * known.means, known.speakers)  # another unit
+        other = fm.NearestSpeakerAccuracy(small, components=components, shrinkage=shrinkage)
+        other.update(1e-6 * torch.from_numpy(clips), nearest.tolist())
+        assert other.compute().item() == 1.0
         template = torch.from_numpy(rng.normal(size=(6, 3)))
         metric.update(torch.from_numpy(clips) + template, ((nearest + 1) % 4).tolist(), template=template)
         assert metric.compute().item() == 0.5
