@@ -9,6 +9,7 @@ import platform
 import secrets
 import shutil
 import sys
+import tempfile
 import time
 import zlib
 from collections.abc import Iterator
@@ -55,23 +56,17 @@ def atomic(path: Path) -> Iterator[Path]:
     owner and its permissions on.
 
     Yields:
-        a path next to the file, renamed at the end and removed if anything fails, with the same suffix, since many
+        a path on the same disk, renamed at the end and removed if anything fails, with the same suffix, since many
         writers choose the format by it.
     """
     with _writing(path):
         target = destination(path)
         _refuse_unwritable(path, target)
-        temporary = _partial(target, path.suffix)
-        with _new_folders(target.parent):
-            if not os.access(target.parent, os.W_OK):  # not every writer's error says so
-                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-            sweep(target.parent)
-            try:
-                yield temporary
-                _hand_on(target, temporary)
-                os.replace(temporary, target)
-            finally:
-                discard(temporary)  # never written, or renamed, or to be given up
+        with scratch_folder(path) as scratch:
+            temporary = scratch / path.name
+            yield temporary
+            _hand_on(target, temporary)
+            os.replace(temporary, target)
 
 
 def discard(path: Path) -> None:
@@ -230,22 +225,18 @@ def check_folder_writable(path: Path) -> None:
 
 
 def _try_to_write(path: Path) -> None:
-    """Make and remove a file in the nearest folder that exists: making folders would race with other processes."""
+    """Open a file in the nearest folder that exists: making folders would race with other processes."""
     folder = path.parent
     while not os.path.lexists(folder) and folder != folder.parent:
         folder = folder.parent
     longest = os.pathconf(folder, "PC_NAME_MAX") if hasattr(os, "pathconf") and folder.is_dir() else 255
     if any(len(os.fsencode(part)) > longest for part in path.parts):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
-    sweep(folder)  # of probes, since nothing else may ever be written here
-    probe = folder / _partial(path).name
-    try:
-        probe.touch()
-    finally:
-        discard(probe)
+    with tempfile.TemporaryFile(dir=folder):  # without a name where the system can
+        pass
 
 
-# What killed processes leave: .NAME.partial-TOKEN.SUFFIX.
+# What killed processes leave: .NAME.partial-TOKEN.
 
 UNLOCKED = ".new"
 """How the names of folders end that are not locked although their process may be at work."""
@@ -253,10 +244,8 @@ LONGEST = 60
 """Bytes of a name that the name of its partial file repeats; a valid name must not become too long by that."""
 
 
-def _partial(path: Path, suffix: str = "") -> Path:
-    name = path.name.removesuffix(path.suffix) if suffix else path.name
-    suffix = suffix if len(os.fsencode(suffix)) <= 24 else ""  # no format has a longer one
-    return path.with_name(f".{short_name(name, LONGEST)}.partial-{secrets.token_hex(8)}{suffix}")
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{short_name(path.stem, LONGEST)}.partial-{secrets.token_hex(8)}")
 
 
 def short_name(name: str, length: int) -> str:
