@@ -14,7 +14,7 @@ from torch import Tensor
 from facediff import registry
 from facediff.models import samplers
 from facediff.models.dual_path.recipe import log_snr_weights
-from facediff.models.samplers import SCHEDULES, DpmSolverSampler, NoiseProcess, Sampler, unit_noise
+from facediff.models.samplers import SCHEDULES, DpmSolverSampler, NoiseProcess, Sampler, unit_noise, visited
 
 
 @pytest.mark.parametrize("steps", [1, 10, 999, 1000])
@@ -292,6 +292,7 @@ def test_any_spacing_visits_each_step_once(name: str, spacing: str, steps: int, 
     assert places[0] == 999
     assert places == sorted(set(places), reverse=True)
     assert places[-1] >= 0
+    assert places == visited(made.process, steps, spacing, last_noise)  # type: ignore[arg-type]
     if last_noise is not None and steps > 1:
         assert math.exp(-log_snr(made.process, places[-1:])[0]) == pytest.approx(last_noise, rel=0.2)
     assert torch.equal(
