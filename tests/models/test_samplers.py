@@ -292,7 +292,7 @@ def test_any_spacing_visits_each_step_once(name: str, spacing: str, steps: int, 
     assert places[0] == 999
     assert places == sorted(set(places), reverse=True)
     assert places[-1] >= 0
-    assert places == visited(made.process, steps, spacing, last_noise)  # type: ignore[arg-type]
+    assert places == visited(made.process, steps, spacing, last_noise)
     if last_noise is not None and steps > 1:
         assert math.exp(-log_snr(made.process, places[-1:])[0]) == pytest.approx(last_noise, rel=0.2)
     assert torch.equal(
