@@ -97,7 +97,8 @@ def hash_of(content: object) -> str:
 def with_code(content: Mapping[str, Any]) -> dict[str, Any]:
     """Plain data, with the SHA-256 of the researcher's own modules and packages that its class paths name."""
     code: dict[str, str] = {}
-    for name in {*re.findall(r'"([A-Za-z_]\w*)\.[\w.]+\\?"(?!:)', json.dumps(content, default=str))} - {"facediff"}:
+    names = re.findall(r'"([A-Za-z_]\w*)\.[\w.]+\\?"(?!:)', json.dumps(content, default=str))
+    for name in {*names} - {"facediff", "__main__"}:
         if (folder := own_code(name)) is not None:
             files = [folder / f"{name}.py", *(folder / name).rglob("*.py")]
             code |= {file.relative_to(folder).as_posix(): sha256(file) for file in files if file.is_file()}
