@@ -116,17 +116,20 @@ def scratch_folder(path: Path) -> Iterator[Path]:
         target = destination(path)
         with _new_folders(target.parent):
             sweep(target.parent)
-            folder = _partial(target)
-            # The folder is locked before it gets its name, so that no other process removes it as abandoned.
-            unnamed = folder.with_name(f"{folder.name}{UNLOCKED}")
-            unnamed.mkdir()
-            with _locked_folder(unnamed):
+            with ExitStack() as stack:
+                folder = _partial(target)
+                folder.mkdir()
+                # Another process that sweeps in between takes it for abandoned.
+                while stack.enter_context(_locked_folder(folder)) is False or not folder.is_dir():
+                    folder = _partial(target)
+                    folder.mkdir()
                 try:
-                    unnamed.rename(folder)
                     yield folder
                 finally:
-                    discard(folder)
-                    discard(unnamed)
+                    try:
+                        discard(folder)
+                    finally:
+                        discard(folder)  # a signal may have cut the first short
 
 
 def put_in_place(source: Path, target: Path, *, replace: bool = True) -> None:
@@ -238,8 +241,6 @@ def _try_to_write(path: Path) -> None:
 
 # What killed processes leave: .NAME.partial-TOKEN.
 
-UNLOCKED = ".new"
-"""How the names of folders end that are not locked although their process may be at work."""
 LONGEST = 60
 """Bytes of a name that the name of its partial file repeats; a valid name must not become too long by that."""
 
@@ -277,7 +278,7 @@ def sweep(folder: Path) -> None:
                     os.unlink(entry)
                 continue
             with _locked_folder(Path(entry.path)) as lock:
-                if (lock and not entry.name.endswith(UNLOCKED)) or (lock is not False and old):
+                if lock or (lock is None and old):
                     shutil.rmtree(entry, ignore_errors=True)
 
 
