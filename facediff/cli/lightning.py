@@ -389,7 +389,8 @@ def words_of_checkpoint(name: str, path: Path, arguments: Sequence[str]) -> list
     if data in (None, trained, trained.rpartition(".")[2]):
         corpus, corpus_options = corpus_of(path, checkpoint)
         if not any(word.startswith(("--data.root", "--data.init_args.root")) for word in arguments):
-            needed = inspect.signature(corpus).parameters["root"].default is inspect.Parameter.empty
+            root = inspect.signature(corpus).parameters.get("root")  # a corpus may hand it on with its other options
+            needed = root is None or root.default is inspect.Parameter.empty
             if needed and corpus_options.get("root") is None:
                 raise FaceDiffError(f"{path}: does not say where the corpus is; add --data.root=FOLDER")
             tell_folder(path, corpus_options)

@@ -24,8 +24,10 @@ import yaml
 from facediff.callbacks import checkpoints
 from facediff.cli.app import main
 from facediff.cli.lightning import words_of_checkpoint
+from facediff.data.batch import DATA_SOURCE_KEY
 from facediff.errors import FaceDiffError
 from facediff.models import DualPathDiffusion, load_model
+from facediff.models.pretrained import DATA_OPTIONS_KEY
 from tests.cli.conftest import SMALL
 from tests.fakes import processes, tiny
 from tests.fakes.parsing import printed_config
@@ -326,6 +328,15 @@ def test_two_processes_train_together(tiny_root: Path, tmp_path: Path) -> None:
     # Eight training clips, two clips a batch, two processes: two steps.
     assert torch.load(run / "last.ckpt", weights_only=True)["global_step"] == 2
     load_model(run / "best.ckpt")
+
+
+@pytest.mark.parametrize("corpus", ["biwi.Biwi", "mead3d.Mead3D"])
+def test_a_checkpoint_without_its_corpus_asks_for_the_folder(corpus: str, checkpoint: Path, tmp_path: Path) -> None:
+    content = torch.load(checkpoint, weights_only=True)
+    path = tmp_path / "moved.ckpt"
+    torch.save(content | {DATA_SOURCE_KEY: {"class_path": f"facediff.data.{corpus}"}, DATA_OPTIONS_KEY: {}}, path)
+    with pytest.raises(FaceDiffError, match="does not say where the corpus is; add --data.root"):
+        words_of_checkpoint("test", path, [])
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
