@@ -37,9 +37,8 @@ def test_the_nearest_speaker_is_that_of_the_documented_distance() -> None:
         metric.update(torch.from_numpy(clips), nearest.tolist())
         assert metric.compute().item() == 1.0
         small = fm.SpeakerGallery(1e-6 * known.means, known.speakers)  # another unit
-        other = fm.NearestSpeakerAccuracy(small, components=components, shrinkage=shrinkage)
-        other.update(1e-6 * torch.from_numpy(clips), nearest.tolist())
-        assert other.compute().item() == 1.0
+        shrunk = 1e-6 * torch.from_numpy(clips), nearest.tolist(), small
+        assert fm.nearest_speaker_accuracy(*shrunk, components=components, shrinkage=shrinkage).item() == 1.0
         template = torch.from_numpy(rng.normal(size=(6, 3)))
         metric.update(torch.from_numpy(clips) + template, ((nearest + 1) % 4).tolist(), template=template)
         assert metric.compute().item() == 0.5
