@@ -19,7 +19,7 @@ def test_what_a_run_that_was_killed_in_its_first_save_left_is_swept(tmp_path: Pa
     checkpoints = tmp_path / "small" / "version_0" / "checkpoints"
     checkpoints.mkdir(parents=True)
     for place in (checkpoints / "last.ckpt", checkpoints.parent / "config.yaml"):
-        files._partial(place, place.suffix).write_bytes(b"x")
+        files._partial(place).mkdir()
     (checkpoints.parent / LOCK).write_bytes(b"x")
     trainer = Trainer(logger=CSVLogger(tmp_path, name="small"), accelerator="cpu", enable_progress_bar=False)
     with entered_run(trainer, []):
@@ -36,9 +36,8 @@ def test_the_lock_of_a_run_that_goes_on_stays(tmp_path: Path) -> None:
 
 
 def test_a_folder_next_to_a_run_that_no_run_has_locked_is_left_alone(tmp_path: Path) -> None:
-    half = files._partial(tmp_path / "films" / "hello.mp4", ".mp4")  # of a command that is at work
-    half.parent.mkdir()
-    half.write_bytes(b"x")
+    half = files._partial(tmp_path / "films" / "hello.mp4")  # of a command that is at work
+    half.mkdir(parents=True)
     trainer = Trainer(logger=CSVLogger(tmp_path, name=""), accelerator="cpu", enable_progress_bar=False)
     with entered_run(trainer, []):
         assert run_folder(trainer).parent == tmp_path
