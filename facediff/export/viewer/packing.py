@@ -8,7 +8,9 @@ import math
 import weakref
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from tempfile import TemporaryFile
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +37,7 @@ class Blobs:
 
     def __init__(self) -> None:
         self._file = TemporaryFile()  # noqa: SIM115 - as long as this object
-        weakref.finalize(self, self._file.close)
+        weakref.finalize(self, _close, self._file)
         self._sizes: list[int] = []
         self._numbers: dict[bytes, int] = {}
         self.size = 0
@@ -70,6 +72,11 @@ class Blobs:
             for start in range(0, size, PIECE):
                 yield self._file.read(min(PIECE, size - start)).decode("ascii")
             yield "</script>\n"
+
+
+def _close(file: IO[bytes]) -> None:
+    with suppress(OSError):  # what a full disk could not hold has been said when it was written
+        file.close()
 
 
 def millimetres(animation: Animation) -> float:
