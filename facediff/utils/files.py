@@ -117,12 +117,12 @@ def scratch_folder(path: Path) -> Iterator[Path]:
         with _new_folders(target.parent):
             sweep(target.parent)
             with ExitStack() as stack:
-                folder = _partial(target)
-                folder.mkdir()
-                # Another process that sweeps in between takes it for abandoned.
-                while stack.enter_context(_locked_folder(folder)) is False or not folder.is_dir():
+                while True:
                     folder = _partial(target)
                     folder.mkdir()
+                    # Another process that sweeps in between takes it for abandoned: then there is to be another one.
+                    if stack.enter_context(_locked_folder(folder)) is not False and folder.is_dir():
+                        break
                 try:
                     yield folder
                 finally:
