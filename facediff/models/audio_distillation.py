@@ -34,7 +34,7 @@ from facediff.models.layers import frame_mask
 from facediff.speech.audio import RECORDINGS, read_speech
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import USUAL_VOICE_STEPS
-from facediff.utils.workers import processors
+from facediff.utils.workers import processors, torch_threads
 
 ROBUST_AUGMENTATIONS = (
     "voice:share=0.8,semitones=6,formants=0.22",
@@ -132,14 +132,13 @@ def distil_audio_encoder(
     workers = min(options.workers, processors() - 1)
     loader = DataLoader(pairs, batch_size=None, num_workers=workers)
     # A thread that shares its core with a worker keeps the others waiting: two on two cores take half as long again.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(max(1, threads - workers))
+    threads = max(1, torch.get_num_threads() - workers)
     optimiser = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.01)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, options.steps))
     errors: list[float] = []
     devices = [] if model.device.type == "cpu" else [model.device]
     # The caller's random numbers go on as if nothing had been drawn here.
-    with torch.random.fork_rng(devices):
+    with torch.random.fork_rng(devices), torch_threads(threads):
         torch.manual_seed(options.seed)
         student.train()
         for batch in loader:
@@ -157,7 +156,6 @@ def distil_audio_encoder(
             schedule.step()
             errors.append(float(error.detach()))
             step_done()
-    torch.set_num_threads(threads)
     student.eval()
     with torch.no_grad():
         for weight, old in zip(weights, before, strict=True):

@@ -206,8 +206,16 @@ def one_thread_each() -> Iterator[None]:
         with _one_thread_variables():
             yield
         return
+    with torch_threads(1):
+        yield
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """PyTorch, which is imported already, computes on so many threads."""
+    torch: Any = sys.modules["torch"]
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
