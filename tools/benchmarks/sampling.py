@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from machine import machine, peak_memory
@@ -26,13 +26,15 @@ from facediff.data import Assets, Batch, Sample, collate
 from facediff.models import DualPathDiffusion
 from facediff.models.audio_encoders import HubertEncoder, MelEncoder
 from facediff.models.decoders import StyleTransformer
-from facediff.models.dual_path.conditioning import Conditions
 from facediff.models.folding import SamplingSpace
 from facediff.models.fusions import BidirectionalCrossAttention
 from facediff.models.inference import ClipNoise
 from facediff.models.samplers import Sampler
 from facediff.models.speaker_encoders import TcnGruTransformer
 from facediff.speech.audio import samples_for
+
+if TYPE_CHECKING:
+    from facediff.models.dual_path.conditioning import Conditions
 
 FRAME_RATE = 25.0
 IDENTITIES = ["F2", "F3", "F4", "M3", "M4", "M5"]
