@@ -116,15 +116,15 @@ def measure_windows(
 
     def measure() -> npt.NDArray[np.float64]:
         total, count = torch.zeros((), dtype=torch.float64), 0
+        shapes: dict[str, Tensor] = {}
         for clip in clips:
+            motion = corpus.read_projected(clip, lambda offsets: project(offsets[None])[0], shapes).double()
             # From the middle of long clips: a part of each tells as much as all of it.
-            frames = corpus.frames(clip)
-            first = max(0, (frames - WINDOWS * width) // 2)
-            motion = corpus.read_motion(clip, first, min(frames, first + WINDOWS * width))
-            windows = project(motion[None].float())[0].double().unfold(0, width, 1) if frames >= width else motion[:0]
-            if len(windows):
-                total = total + torch.einsum("nki,nkj->kij", windows, windows)
-                count += len(windows)
+            first = max(0, (len(motion) - WINDOWS * width) // 2)
+            if len(motion) >= width:
+                windows = motion[first : first + WINDOWS * width].unfold(0, width, 1).permute(1, 2, 0).contiguous()
+                total = total + windows @ windows.mT
+                count += windows.shape[2]
         if not count:
             raise FaceDiffError(
                 f"{corpus.root}: no training clip lasts {width} frames; choose a smaller motion_space.prior_frames"
