@@ -22,10 +22,9 @@ from machine import machine
 from facediff.reporting.documents import markdown_table
 from facediff.utils import SAMPLE_RATE
 
-HERE = Path(__file__).parent
 FACEDIFF = ["-m", "facediff"]
 FIT = [*FACEDIFF, "fit", "--config", "configs/experiment/puppet.yaml", "--trainer.max_steps=100"]
-SAMPLING = [str(HERE / "sampling.py"), "--repeats", "3"]
+SAMPLING = [str(Path(__file__).with_name("sampling.py")), "--repeats", "3"]
 FULL = r"folded, in full: ([\d.]+) s"
 WORK: list[tuple[list[str], dict[str, str]]] = [
     (["-c", "import facediff"], {"import facediff": ""}),
@@ -45,7 +44,6 @@ def main() -> None:
     parser.add_argument("trees", type=Path, nargs=2, metavar="TREE", help="source trees: the old version, the new one")
     parser.add_argument("--rounds", type=int, default=3, help="turns of each command (default: 3)")
     options = parser.parse_args()
-    print(f"{machine()}\n", flush=True)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         soundfile.write(Path(folder) / "speech.wav", speech(6.0), SAMPLE_RATE)
@@ -61,7 +59,7 @@ def main() -> None:
             for name, times in seconds.items():
                 old, new = min(times[::2]), min(times[1::2])
                 rows.append([name, f"{old:.2f} s", f"{new:.2f} s", f"{new / old:.2f}"])
-    print(markdown_table(["", *(tree.name for tree in options.trees), "ratio"], rows))
+    print(machine(), "", markdown_table(["", *(tree.name for tree in options.trees), "ratio"], rows), sep="\n")
 
 
 if __name__ == "__main__":
