@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import os
 import re
 import sys
 from collections import Counter
@@ -95,8 +96,8 @@ def hash_of(content: object) -> str:
 
 
 def with_code(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data, with the SHA-256 of the researcher's own modules and packages that its class paths name."""
-    code: dict[str, str] = {}
+    """Plain data, with the files that it names, and the SHA-256 of the researcher's own code in its class paths."""
+    content, code = _with_files(content, Path()), dict[str, str]()
     names = re.findall(r'"([A-Za-z_]\w*)\.[\w.]+\\?"(?!:)', json.dumps(content, default=str))
     for name in {*names} - {"facediff", "__main__"}:
         if (folder := own_code(name)) is not None:
@@ -229,20 +230,26 @@ def _content(kind: Kind, path: Path) -> dict[str, Any]:
 
 
 def _manifest(root: Path | None) -> str:
-    path = None if root is None else root / "manifest.json"
-    return sha256(path) if path is not None and path.is_file() else "none"
+    if root is None or not root.is_dir():
+        return "none"
+    if (manifest := root / "manifest.json").is_file():
+        return sha256(manifest)
+    files = sorted((str(path.relative_to(root)), path.stat()) for path in root.rglob("*") if path.is_file())
+    return hash_of([(name, status.st_size, status.st_mtime_ns) for name, status in files])
 
 
-def config_content(path: Path) -> object:
+def config_content(path: Path) -> Any:  # noqa: ANN401
     """The plain data of a config, with the content of the configs that it names: comments do not count."""
+    return _with_files(load_yaml(path, "expected a config such as configs/experiment/puppet.yaml"), path.parent)
 
-    def expand(value: object) -> object:
-        if isinstance(value, dict):
-            return {str(key): expand(entry) for key, entry in value.items()}
-        if isinstance(value, list):
-            return [expand(entry) for entry in value]
-        if isinstance(value, str) and value.endswith((".yaml", ".yml")) and (path.parent / value).is_file():
-            return config_content((path.parent / value).resolve())
-        return value
 
-    return expand(load_yaml(path, "expected a config such as configs/experiment/puppet.yaml"))
+def _with_files(value: Any, folder: Path) -> Any:  # noqa: ANN401
+    """Plain data, with the content of the configs that it names, and the SHA-256 of other files."""
+    if isinstance(value, dict):
+        return {str(key): _with_files(entry, folder) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_with_files(entry, folder) for entry in value]
+    if not isinstance(value, str) or not Path(value).suffix or not os.path.isfile(folder / value):  # noqa: PTH113
+        return value  # which may be too long for a path: pathlib raises then
+    file = (folder / value).resolve()
+    return config_content(file) if file.suffix in (".yaml", ".yml") else sha256(file)

@@ -340,7 +340,7 @@ def data_of(
 
 def truth_words(data: SpeechMotionDataModule) -> tuple[str, ...]:
     """How `facediff evaluate` is told of a corpus's truth."""
-    stride = round(data.stored_frame_rate / data.frame_rate) if data.stored_frame_rate else 1
+    stride = data.corpus.stride
     return (str(data.root), *(["--truth-stride", str(stride)] if stride > 1 else []))
 
 

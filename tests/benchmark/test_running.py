@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,30 @@ def test_a_changed_config_runs_its_own_cells_again_and_those_alone(folder: Path)
     assert {cell.row for cell in run(folder)} == {"one", "two"}
     (folder / "plan.yaml").write_text(PLAN.replace("[0, 1]", "[0, 2]"))
     assert {cell.seed for cell in run(folder)} == {2}
+
+
+def test_files_that_options_name_and_folders_without_a_manifest_count(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "plan.yaml").write_text(ONE_SEED)
+    plan = read_plan(folder / "plan.yaml")
+    corpus = next(iter(plan.corpora.values()))
+    method = replace(plan.methods["two"], options={"model.decoder": "mine.yaml"})
+    plan = replace(
+        plan, baseline="two", methods={"two": method}, corpora={corpus.name: replace(corpus, root=folder / "data")}
+    )
+
+    def key() -> str:
+        (cell,) = cells_of(plan)
+        return cell.key
+
+    keys = [key()]
+    for file, text in (("mine.yaml", "width: 1"), ("mine.yaml", "width: 2"), ("data/a.npy", "a"), ("data/a.npy", "ab")):
+        (folder / file).parent.mkdir(exist_ok=True)
+        (folder / file).write_text(text)
+        keys += [key()]
+    assert len({*keys}) == len(keys)
 
 
 @pytest.mark.parametrize("place", ["", "installed in place"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from facediff.cli.benchmark import truth_words
 from facediff.errors import FaceDiffError
 from tests.fakes.mini import VERTICES, MiniVocaset, names_of, write
 
@@ -72,6 +73,8 @@ def test_sixty_stored_frames_a_second_become_thirty_by_every_second(tmp_path: Pa
     prepared = MiniVocaset(root=str(root))
     assert prepared.corpus.frames(prepared.corpus.clips[clip.name]) == 7
     assert prepared.assets().unit == "mm"
+    assert truth_words(prepared) == (str(root),)  # and a benchmark's predictions are scored at it
+    assert truth_words(data)[1:] == ("--truth-stride", "2")
     (root / "manifest.json").write_text('{"frame_rate": 50}')
     with pytest.raises(FaceDiffError, match=r"frame_rate is 50.*30 frames"):
         _ = MiniVocaset(root=str(root)).corpus
