@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -11,8 +12,8 @@ import numpy.typing as npt
 from facediff.data.storage import ChannelFolder
 from facediff.errors import FaceDiffError
 from facediff.spaces import Space
-from facediff.spaces.files import ParameterClip, even, read_parameters
-from facediff.spaces.operations import at_times, permuted
+from facediff.spaces.files import ParameterClip, even, from_start, read_parameters
+from facediff.spaces.operations import permuted
 from facediff.speech.audio import read_stretch
 from facediff.utils.arrays import ArrayStore
 from facediff.utils.files import cache_dir
@@ -89,12 +90,8 @@ class RecordingFolder(ChannelFolder):
             return stored
         clip = even(self.recording(name))
         values, _ = permuted(clip.values, clip.space, self.space)
-        # BEAT's first frame lies 1/60 s after the sound's beginning; a timecode begins at the time of day.
-        start = clip.start if path.suffix.lower() == ".json" else 0.0
-        times = start + np.arange(len(values)) / clip.frame_rate
-        new_times = np.arange(int(times[-1] * self.frame_rate + 1e-6) + 1) / self.frame_rate
-        resampled = at_times(values, self.space, times, new_times).astype(np.float32)
-        return self._store.put(key, resampled)
+        clip = replace(clip, values=values, space=self.space)
+        return self._store.put(key, from_start(clip, self.frame_rate).astype(np.float32))
 
     def speech(self, name: str, first: int, length: int, store: ArrayStore) -> npt.NDArray[np.float32]:
         """Samples of the recording's sound file; see :func:`~facediff.speech.audio.read_stretch`."""

@@ -12,7 +12,7 @@ from facediff.editing.controls.procedural import move_head
 from facediff.errors import FaceDiffError
 from facediff.spaces.arkit import arkit_name
 from facediff.spaces.decoding import ChannelDecoder
-from facediff.spaces.files import even, read_parameters
+from facediff.spaces.files import even, from_start, read_parameters
 
 SUFFIXES = (".csv", ".json")
 """Tables of Live Link Face or Audio2Face, and BEAT's files."""
@@ -31,7 +31,7 @@ def read_weights(path: Path) -> Animation:
     moves = dict(zip(rig.names, rig.deltas, strict=True))
     deltas = np.stack([moves.get(space.channels[channel], np.zeros(rig.neutral.shape)) for channel in space.face])
     decoder = ChannelDecoder(space, np.zeros(len(space.channels)), rig.neutral, deltas)
-    points = np.asarray(clip.values, np.float32)[..., None]
+    points = np.asarray(from_start(clip, clip.frame_rate), np.float32)[..., None]
     animation = Animation(
         path.stem,
         decoder.vertices(points),

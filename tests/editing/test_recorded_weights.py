@@ -46,6 +46,14 @@ def test_names_in_another_case_move_the_face_too(tmp_path: Path) -> None:
     assert other.space.channels == ("jawOpen", "mouthPucker")
 
 
+def test_an_excerpt_keeps_its_place_in_the_sound(tmp_path: Path) -> None:
+    frames = '[{"weights": [0], "time": 0.5}, {"weights": [1], "time": 0.6}, {"weights": [0], "time": 0.7}]'
+    (tmp_path / "a.json").write_text(f'{{"names": ["jawOpen"], "frames": {frames}}}')
+    animation = facediff.read(tmp_path / "a.json")
+    moved = np.abs(animation.vertices - animation.vertices[0]).max((1, 2))
+    assert moved.argmax() / animation.frame_rate == pytest.approx(0.6)
+
+
 def take_of(path: Path, frames: int = 30) -> ParameterClip:
     """Weights above 1, a head and eyes that turn."""
     space, rng, time = layout("live_link"), np.random.default_rng(3), np.arange(frames)[:, None] / 30

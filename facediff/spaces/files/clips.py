@@ -66,6 +66,15 @@ def even(clip: ParameterClip) -> ParameterClip:
     return replace(clip, values=values.astype(np.float32), times=None)
 
 
+def from_start(clip: ParameterClip, rate: float) -> Array:
+    """Values (T, C) at a rate from the beginning of the sound, of a clip with even rows.
+
+    BEAT's first frame lies 1/60 s after it, an excerpt's later; a timecode begins at the time of day.
+    """
+    times = (0.0 if clip.layout == "live_link" else clip.start) + np.arange(len(clip.values)) / clip.frame_rate
+    return at_times(clip.values, clip.space, times, np.arange(int(times[-1] * rate + 1e-6) + 1) / rate)
+
+
 def checked(path: Path, values: Floats, frame_rate: float) -> Values:
     """Values of a file (T, C) as float32, finite."""
     check_number(path, "frame rate", frame_rate, *FRAME_RATES)

@@ -133,10 +133,12 @@ def read_live_link(path: Path) -> ParameterClip:
         header = [*header, *lacking]
     columns = columns_of(path, header, space)
     at_time = header.index(TIMECODE)
-    times, values, numbers = [], [], []
+    times, numbers = list[tuple[int, float]](), list[int]()
+    values = []
     for number, row in enumerate(rows, start=2):
-        if not any(row[2:]):
-            continue  # a frame in which the phone saw no face: its row has a timecode and nothing else
+        seen = any(row[2:])  # or the phone saw no face: the row has a timecode and nothing else
+        if not seen and times:
+            continue
         stamp = fields_of(row[at_time]) if len(row) > at_time else None
         if stamp is None:
             raise FaceDiffError(
@@ -145,7 +147,10 @@ def read_live_link(path: Path) -> ParameterClip:
             )
         times.append(stamp)
         numbers.append(number)
-        values.append(_numbers(path, number, [*row, *("0" for _ in lacking)], columns, len(header)))
+        if seen:
+            values.append(_numbers(path, number, [*row, *("0" for _ in lacking)], columns, len(header)))
+    # The sound does not wait for a face: the first one stands at the take's beginning too.
+    values[:0] = values[: len(times) - len(values)]
     clock = _clock(path, np.array(times).reshape(-1, 2))
     rate = rate_of(path, clock, [f"row {number}" for number in numbers])
     table = checked(path, np.array(values), rate)

@@ -222,6 +222,18 @@ def test_a_gap_of_hours_is_refused_by_its_row(form: str, tmp_path: Path) -> None
         read_parameters(path)
 
 
+def test_a_take_that_begins_without_a_face_begins_with_its_sound(tmp_path: Path) -> None:
+    write_sine(path := tmp_path / "take.csv", coded(12, 60, 60), 60)
+    expected = read_parameters(path)
+    header, *rows = path.read_text().splitlines()
+    blank = [",".join([*row.split(",")[:2], *[""] * (row.count(",") - 1)]) for row in rows[:3]]
+    path.write_text("\n".join([header, *blank, *rows[3:]]))
+    found = even(read_parameters(path))
+    assert found.start == expected.start
+    np.testing.assert_allclose(found.values[3:], even(expected).values[3:], atol=1e-6)
+    np.testing.assert_allclose(found.values[:3], found.values[[3] * 3], atol=1e-6)
+
+
 @pytest.mark.parametrize("column", ["JawOpen", "jawopen", "Timecode", "timecode ", " BlendShapeCount"])
 def test_a_column_twice_is_refused(column: str, tmp_path: Path) -> None:
     path = write_take(tmp_path / "take.csv")
