@@ -17,6 +17,9 @@ from facediff.export.sequences import RECORD
 from facediff.mesh.textures import has_textures
 from facediff.utils.files import check_writable, put_in_place, scratch_folder
 
+COMPANIONS = (b"facediff blendshape weights", b"facediff sequence")
+"""A file of JSON that holds one of them may be replaced without having been named."""
+
 OPTIONS = ("view", "size", "video_rate", "tolerance", "shapes", "tracks", "key_tolerance", "surface")
 """Options that some formats use."""
 
@@ -224,7 +227,8 @@ def is_free(path: Path) -> bool:
             return recorded and all(file.is_file() and is_free(file) for file in files)
         with path.open("rb") as stream:
             start = stream.read(200)
-            return not start or MARK in start
+            ours = COMPANIONS if path.suffix == ".json" else (MARK,)  # a direction or answers, made by hand, say it too
+            return not start or any(mark in start for mark in ours)
     return False
 
 

@@ -16,6 +16,7 @@ import pytest
 from facediff.animation import Animation, write_archive
 from facediff.errors import FaceDiffError
 from facediff.export import FORMATS, ExportOptions, check_export, write_animations
+from facediff.export.writing import check_free
 from facediff.synthetic.known_faces import built_in_shapes
 
 VIDEOS = (".mp4", ".webm", ".gif")
@@ -159,6 +160,10 @@ def test_files_next_to_an_export_never_replace_the_users_own(animation: Animatio
         write_animations(tmp_path / "face.mdd", [animation])
     assert (tmp_path / "face.obj").read_text() == "v 0 0 0\n"
     assert (tmp_path / "hello.wav").read_bytes() == (tmp_path / "hello_speech.wav").read_bytes() == before
+    (tmp_path / "hello.json").write_text('{"format": "facediff direction 1"}')
+    with pytest.raises(FaceDiffError, match=r"hello\.json: is a file that facediff did not write"):
+        check_free(tmp_path / "hello.json")
+    (tmp_path / "hello.json").unlink()
     (tmp_path / "hello.wav").write_bytes(b"")  # a run before was cut off here; nobody loses anything
     written = write_animations(tmp_path / "hello.usda", [animation])
     assert [path.name for path in written] == ["hello.usda", "hello.wav"]
