@@ -92,11 +92,16 @@ def align_recordings(
         scheduler: where; see :func:`facediff.utils.jobs.run_tasks`.
         progress: whether to show a progress bar.
     """
-    recipe = Recipe(("align",), {})
-    tasks = []
+    made: dict[Path, FileTask] = {}
     for path, speaker in find_recordings(source).items():
         name = "_".join(path.relative_to(source).with_suffix("").parts[1:]) or path.stem
-        tasks.append(FileTask(path, out / ALIGNMENTS / speaker / f"{name}.TextGrid", recipe))
+        output = out / ALIGNMENTS / speaker / f"{name}.TextGrid"
+        if output in made:
+            raise FaceDiffError(f"{path}: would be written as {made[output].source} is; rename one of them")
+        words = [path.with_suffix(".TextGrid"), path.with_suffix(".txt"), *path.parent.glob("*.trans.txt")]
+        recipe = Recipe.of(("align",), [file for file in words if file.is_file()])
+        made[output] = FileTask(path, output, recipe)
+    tasks = made.values()
     pending = [task for task in tasks if not task.output.exists() or task.change()]
     for task in pending:
         task.output.parent.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from operator import methodcaller
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -237,7 +238,15 @@ def _is_complete(plan: PreparationPlan, complete: dict[str, int], out: Path, man
         and len(complete) == len(plan.jobs)
         and all(manifest.get(name) == value for name, value in parts.items())
         and same_sizes(out, manifest.get("files", {}))
+        and _same_shared(plan, manifest.get("files", {}))
     )
+
+
+def _same_shared(plan: PreparationPlan, files: Mapping[str, Any]) -> bool:
+    """Whether the plan would write the files of all clips as a manifest records them: regions may be other ones now."""
+    with TemporaryDirectory() as folder:
+        shared = describe_files(Path(folder), plan.shared(Path(folder)))
+    return all(files.get(name) == facts for name, facts in shared.items())
 
 
 def settings(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from facediff.synthetic import corpus as puppet
 from facediff.synthetic.cast import ALIGNED, MOST_DRAWN, SEEN, UNSEEN, drawn_names, recorded_names
 from facediff.synthetic.head.rig import SHAPES
 from facediff.synthetic.known_faces import built_in_rig as built_in_rig
-from facediff.synthetic.recordings import speakers_of
+from facediff.synthetic.recordings import speakers_of, state_of
 from facediff.utils.arrays import open_array, open_vertices
 from facediff.utils.files import cache_dir
 from facediff.utils.licences import Commercial
@@ -83,9 +83,9 @@ def cache_root(seed: int = 0, drawn_speakers: int = 0, people: Sequence[str] = (
     """The corpus's folder: below ``$FACEDIFF_CACHE``, else ``~/.cache/facediff``."""
     more = f"-drawn{drawn_speakers}" if drawn_speakers else ""
     more += f"-people{len(people)}" if people else ""
-    # Two folders of recordings may have equally many speakers.
+    # Two folders of recordings may have equally many speakers, and a TextGrid may be corrected.
     if recorded_names(people):
-        more += "-" + hashlib.sha256("\n".join(people).encode()).hexdigest()[:8]
+        more += "-" + hashlib.sha256("\n".join([*people, state_of(people)]).encode()).hexdigest()[:8]
     return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}{more}"
 
 

@@ -40,7 +40,7 @@ from facediff.synthetic.head.people import Complexion, coloured, dressed
 from facediff.synthetic.head.rig import SHAPES, eyelid_pairs, head_shapes, lip_pairs, lip_teeth_pairs
 from facediff.synthetic.performance import MOODS, FaceMotion, synthesise_motion
 from facediff.synthetic.prosody import analyse
-from facediff.synthetic.recordings import recordings_of
+from facediff.synthetic.recordings import recordings_of, state_of
 from facediff.synthetic.sentences import GERMAN, SENTENCES, TEST, TRAIN, VALIDATION, WORDS, turn
 from facediff.synthetic.voices import Delivery, Flite, coloured_speech, open_voice
 from facediff.utils import SAMPLE_RATE
@@ -257,7 +257,8 @@ def _is_complete(root: Path, facts: dict[str, object]) -> bool:
 def _facts(seed: int, drawn: int, people: Sequence[str], variant: CorpusVariant) -> dict[str, object]:
     # Without what test C is spoken with: a folder stays whole where flite is installed later, or is missing.
     facts = {"corpus": variant.corpus, "format": 1, "generator": GENERATOR, "seed": seed, "drawn": drawn}
-    return {**facts, "people": list(people)}
+    recordings = state_of(people)
+    return {**facts, "people": list(people), **({"recordings": recordings} if recordings else {})}
 
 
 def resting_head(member: CastMember) -> NDArray[np.float64]:

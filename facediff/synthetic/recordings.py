@@ -6,7 +6,9 @@ WebMAUS write. The recordings are used as they are; the motion's truth is made f
 
 from __future__ import annotations
 
+import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -74,6 +76,14 @@ def speakers_of(folder: Path) -> tuple[str, ...]:
             f"{folder}: holds no aligned recording; expected SPEAKER/NAME.wav or .flac, each with NAME.TextGrid"
         )
     return speakers
+
+
+def state_of(people: Sequence[str]) -> str:
+    """A hash of the names, sizes and times of all recordings and TextGrids of people's voices; empty without any."""
+    folders = [Path(voice.removeprefix(f"{ALIGNED}:")) for voice in people if voice.startswith(f"{ALIGNED}:")]
+    files = sorted((str(path), path.stat()) for folder in folders for path in folder.rglob("*.*"))
+    facts = [(name, status.st_size, status.st_mtime_ns) for name, status in files]
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16] if facts else ""
 
 
 def recordings_of(speaker: str, count: int) -> list[Recording]:

@@ -86,6 +86,19 @@ def test_what_cannot_be_aligned_is_named_and_the_rest_is_done(
         find_recordings(tmp_path / "out" / "bert")
 
 
+def test_corrected_phones_are_aligned_again_and_no_recording_replaces_another(tmp_path: Path) -> None:
+    write_aligned(tmp_path / "in" / "anna" / "a.wav", 4.0, [])
+    before = align_recordings(tmp_path / "in", tmp_path / "out", workers=1)
+    grid = tmp_path / "in" / "anna" / "a.TextGrid"
+    grid.write_text(grid.read_text().replace('"M"', '"K"'))
+    after = align_recordings(tmp_path / "in", tmp_path / "out", workers=1)
+    assert after.phones == before.phones
+    assert after.closures == 0 < before.closures
+    (tmp_path / "in" / "anna" / "a.flac").write_bytes((tmp_path / "in" / "anna" / "a.wav").read_bytes())
+    with pytest.raises(FaceDiffError, match=r"would be written as .*a\.\w+ is; rename one"):
+        align_recordings(tmp_path / "in", tmp_path / "out", workers=1)
+
+
 def test_a_speaker_is_a_folder_or_the_beginning_of_a_name(tmp_path: Path) -> None:
     for name in ("84-1-0000.flac", "84-1-0001.flac", "anna/tuesday/b.wav", ".hidden/c.wav"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

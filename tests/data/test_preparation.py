@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -159,6 +160,19 @@ def test_other_options_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FaceDiffError, match=r"--dtype was 'float32' and is 'float64'; --subjects was .* and is "):
         prepare(toy_plan(options={"dtype": "float64", "subjects": ["A"]}), out, workers=1)
     assert contents(out) == before
+
+
+def test_other_regions_replace_those_of_before(tmp_path: Path) -> None:
+    """Clips stay; files that clips share are written as the plan has them now."""
+
+    def regions(text: str, out: Path) -> list[str]:
+        (out / "lips.txt").write_text(text)
+        return ["lips.txt"]
+
+    for text in ("1, 2", "3, 4"):
+        report = prepare(replace(toy_plan(), shared=partial(regions, text)), tmp_path / "out", workers=1)
+        assert report.written == 3 * (text == "1, 2")
+        assert (tmp_path / "out" / "lips.txt").read_text() == text
 
 
 def test_another_version_may_read_but_not_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,3 +125,6 @@ def test_two_folders_of_recordings_are_kept_apart(
     roots = [Puppet(drawn_speakers=3, recordings=str(folder)).root for folder in (people, others, Path("people"))]
     assert roots[0] != roots[1]
     assert roots[0] == roots[2]
+    grid = next(people.rglob("*.TextGrid"))
+    grid.write_text(grid.read_text() + "\n")  # corrected: the corpus of before has other phones
+    assert Puppet(drawn_speakers=3, recordings=str(people)).root != roots[0]
