@@ -109,6 +109,7 @@ class CheckpointContent(LightningModule, Inference):
             ("spaces", self.space, assets.space),
             ("identities", self.identities, assets.identities),
             ("frames a second", self.frame_rate, assets.frame_rate),
+            ("units", assets.unit if self._assets is None else self._assets.unit, assets.unit),
         ):
             if mine != stored:
                 raise FaceDiffError(

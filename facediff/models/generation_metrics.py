@@ -443,10 +443,14 @@ def measure(
     n_samples = 1
     for name, load in models.items():
         model = load()
-        if model.assets.identities != corpus.assets.identities or model.n_vertices != data.n_vertices:
+        mine, measured = (
+            (assets.identities, assets.frame_rate, assets.unit, assets.space)
+            for assets in (model.assets, corpus.assets)
+        )
+        if mine != measured or model.n_vertices != data.n_vertices:
             raise FaceDiffError(
-                f"{name}: is a model of {model.assets.corpus} with other speakers or vertices than those of "
-                f"{data.corpus_name} that are measured on; measure it by itself"
+                f"{name}: is a model of {model.assets.corpus} with other speakers, vertices, frame rate or unit than "
+                f"those of {data.corpus_name} that are measured on; measure it by itself"
             )
         if sampling.low_latency:
             model.choose_low_latency()

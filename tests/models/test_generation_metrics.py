@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -234,6 +235,10 @@ def test_several_checkpoints_have_means_and_deviations(tiny: Tiny) -> None:
     assert "0.650 ± 0.212" in text(scores)
     with pytest.raises(FaceDiffError, match="samples"):
         SamplingOptions(samples=1)
+    other = scripted(tiny, noisy)
+    other._assets = replace(other.assets, unit="mm")
+    with pytest.raises(FaceDiffError, match="frame rate or unit"):
+        run(tiny, models[0], other, splits=["test_b"])
 
 
 def test_the_command_writes_what_it_prints(
