@@ -17,13 +17,11 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import CSVLogger, WandbLogger
 from PIL import Image
 
 from facediff.callbacks import SamplingPreview
-from facediff.callbacks.previews import borrowed, first_of_each_identity, scores
 from facediff.data import collate
-from facediff.data.corpus import Clip
 from facediff.models import DualPathDiffusion, load_model
 from facediff.render import Renderer
 from facediff.render.panels import heat_colours
@@ -159,26 +157,6 @@ def test_preview_leaves_training_the_same_digit_for_digit(
 
 
 @pytest.mark.slow
-def test_preview_clips_and_noise_are_the_same_in_every_epoch(
-    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
-) -> None:
-    """With weights that stand still, so do the pictures; another seed gives others."""
-    sheets = []
-    for seed in (0, 0, 1):
-        folder = tmp_path / str(len(sheets))
-        preview = SamplingPreview(**{**SMALL, "names": ["B_e05"], "seed": seed, "seconds": 0.4, "error_scale": None})
-        trainer = make_trainer(max_epochs=2, callbacks=[preview], default_root_dir=folder)
-        trainer.fit(make_model(learning_rate=0.0), datamodule=tiny)
-        one, two = sorted(folder.glob("previews/epoch_*/B_e05.png"))
-        sheets += [np.asarray(Image.open(path)) for path in (one, two)]
-        capture = cv2.VideoCapture(str(one.with_suffix(".mp4")))
-        assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 10  # of 23
-    panels = [sheet[20:60] for sheet in sheets]  # without the footer, where the epoch stands
-    assert all(np.array_equal(panel, panels[0]) for panel in panels[:4])
-    assert not np.array_equal(panels[4], panels[0])
-
-
-@pytest.mark.slow
 def test_preview_is_drawn_when_it_is_due(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
 ) -> None:
@@ -228,25 +206,6 @@ def test_preview_without_a_mesh_is_reported_once(
 
 
 @pytest.mark.slow
-def test_preview_in_tensorboard_has_pictures_and_sound(
-    make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path
-) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    logger = TensorBoardLogger(tmp_path)
-    make_trainer(callbacks=[SamplingPreview(**SMALL)], logger=logger).fit(make_model(), datamodule=tiny)
-    events = EventAccumulator(logger.log_dir).Reload()
-    assert events.Tags()["images"] == [f"preview/{clip}" for clip in CLIPS]
-    assert events.Tags()["audio"] == [f"preview/{clip}" for clip in CLIPS]
-    (image,), (sound,) = events.Images("preview/B_e05"), events.Audio("preview/B_e05")
-    seen = cv2.imdecode(np.frombuffer(image.encoded_image_string, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    (file,) = tmp_path.rglob("previews/epoch_0001/B_e05.png")
-    np.testing.assert_array_equal(seen, np.asarray(Image.open(file)))
-    assert (image.step, sound.sample_rate, sound.length_frames) == (8, 16000, 23 * 640)
-    assert events.Scalars("preview/seconds")[0].value > 0
-
-
-@pytest.mark.slow
 def test_preview_in_wandb_has_videos_and_a_growing_table(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,47 +231,6 @@ def test_preview_in_wandb_has_videos_and_a_growing_table(
     rows = [row for table in tables for row in table["data"]]
     assert [row[:2] for row in rows] == [[clip, epoch] for epoch in (1, 2) for clip in CLIPS]
     assert all(row[2]["_type"] == "video-file" and row[4] > 0 for row in rows)
-
-
-def test_borrowed_model_is_restored(make_model: MakeModel) -> None:
-    model = make_model().train()
-    next(model.children()).eval()  # as a frozen part is
-    modes, sampler = [module.training for module in model.modules()], model.sampler
-
-    def fail() -> NoReturn:
-        with borrowed(model, "dpm_solver", 3):
-            assert not any(module.training for module in model.modules())
-            assert model.sampler is not sampler
-            raise RuntimeError("in between")
-
-    with pytest.raises(RuntimeError, match="in between"):
-        fail()
-    assert [module.training for module in model.modules()] == modes
-    assert model.sampler is sampler
-
-
-def test_first_of_each_identity_comes_before_any_second() -> None:
-    clips = [Clip(name, *name.split("_")) for name in ("A_e1", "A_e2", "A_e3", "B_e1", "C_e1", "C_e2")]  # type: ignore[call-arg]
-    assert first_of_each_identity(clips, 2) == ["A_e1", "B_e1"]
-    assert first_of_each_identity(clips, 5) == ["A_e1", "B_e1", "C_e1", "A_e2", "C_e2"]
-    assert first_of_each_identity(clips[:2], 9) == ["A_e1", "A_e2"]
-
-
-def test_scores_of_a_preview_are_in_the_unit_of_the_protocol_and_of_what_it_scores(
-    make_model: MakeModel, tiny: Tiny, tmp_path: Path
-) -> None:
-    """The corpus is in metres and the protocol in millimetres; the other one takes the numbers of channels."""
-    channels = TinyChannels(root=str(write_channels(tmp_path / "channels")))
-    for data, protocol, off, name, expected in (
-        (tiny, "artalk", torch.tensor([3e-3, 0, 0]), "lve", 3.0),
-        (channels, "facediffuser_beat", torch.tensor([0.2]), "mve", 0.2),
-    ):
-        options = {} if data is tiny else {"n_vertices": 6, "space": CHANNELS}
-        model = make_model(protocol=protocol, **options)
-        model.adopt(data.assets())
-        model.evaluation.prepare(model, ["val"], torch.device("cpu"), data)
-        sample = data.dataset("val")[0]
-        assert scores(model, sample, sample.motion + off)[name] == pytest.approx(expected, rel=1e-4)
 
 
 def test_preview_of_channels_draws_what_the_rig_makes_of_them(

@@ -219,15 +219,6 @@ def test_times_that_go_back(tmp_path: Path) -> None:
         assert like(read_speech(path), whole) > 0.999
 
 
-def test_a_hole_counts_as_long_as_it_lasts(tmp_path: Path) -> None:
-    path = tmp_path / "a.mkv"
-    path.write_bytes(container("matroska", [VOICE], jumps=[(1.0, 1.5)]))
-    with pytest.raises(FaceDiffError, match="max_seconds"):
-        read_speech(path, max_seconds=3.0)
-    with pytest.warns(Note, match=r"1\.50 s of its sound are missing"):
-        assert abs(len(read_speech(path, max_seconds=3.6)) - 3.5 * RATE) < 800
-
-
 @pytest.mark.parametrize("other", [-1.0, -0.8, -0.5, -0.3])
 @pytest.mark.parametrize("subtype", ["PCM_16", "FLOAT", "MPEG_LAYER_III", "aac"])
 def test_channels_that_cancel_are_not_averaged(other: float, subtype: str, tmp_path: Path) -> None:
