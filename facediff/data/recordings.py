@@ -20,6 +20,8 @@ from facediff.utils.files import cache_dir
 from facediff.utils.paths import find_file, name_of_file
 
 USUAL_SUFFIXES = (".csv", ".json")
+METHOD = 2
+"""Goes up when the same recording is read in another way, so that values cached by an older version are not used."""
 
 
 class RecordingFolder(ChannelFolder):
@@ -84,7 +86,7 @@ class RecordingFolder(ChannelFolder):
         path = self.path_of(name)
         status = path.stat()
         parts = (path.resolve(), status.st_size, status.st_mtime_ns, self.space.state(), self.frame_rate, self.layout)
-        key = ArrayStore.key(*parts)
+        key = ArrayStore.key(METHOD, *parts)
         stored = self._store.get(key)
         if stored is not None:
             return stored
