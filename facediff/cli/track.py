@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -126,9 +127,12 @@ def person(
             raise FaceDiffError(f"{root}: is not sound; `facediff data check {root}` says why")
         data = People(root=str(root))
         options = ["--config", CONFIG, f"--data.root={root}", f"--trainer.max_steps={steps}", *ONE_PERSON]
-        options += [f"--trainer.logger.save_dir={root}", "--trainer.logger.name=.training"]
+        # A stopped training of these clips and steps goes on; another video is another training.
+        facts = b"".join((root / name).read_bytes() for name in ("manifest.json", "clips.csv"))
+        training = f".training/{hashlib.sha256(facts + str(steps).encode()).hexdigest()[:8]}"
+        options += [f"--trainer.logger.save_dir={root}", f"--trainer.logger.name={training}"]
         options += [] if data.clips("val") else ["--trainer.limit_val_batches=0"]
-        options += ["--ckpt_path", "last"] if any((root / ".training").glob(f"*/{LAST}")) else []
+        options += ["--ckpt_path", "last"] if any((root / training).glob(f"*/{LAST}")) else []
         trained = run_cli("fit", options)
     trained.trainer.save_checkpoint(output, weights_only=False)
     (who,) = videos

@@ -270,6 +270,7 @@ class PeopleWriter:
         target = median_face(sample, self.model)
         iris = iris_width(pose(sample, target, self.model.weights).faces)
         scale = METRES * (IRIS / iris if self.options.scale == "iris" else 1.0)
+        before = {row["source"] for row in self.rows.values() if row["subject"] == name}
         self._remove(name)
         clips: list[WrittenClip] = []
         for recording, summary in recordings:
@@ -282,6 +283,7 @@ class PeopleWriter:
             self.rows[clip.row["clip"]] = clip.row
         self.templates[name] = self._neutral(clips)
         gaps = np.concatenate([clip.gaps for clip in clips])
+        gone = sorted(before - {clip.row["source"] for clip in clips})
         return PersonReport(
             name=name,
             clips=len(clips),
@@ -289,7 +291,7 @@ class PeopleWriter:
             splits=dict(Counter(clip.row["split"] for clip in clips)),
             iris=iris,
             neutral_gap=float(pair_distances(self.templates[name][None])[0]) / METRES,
-            warnings=tuple(warnings(recordings, clips)),
+            warnings=(*warnings(recordings, clips), *(f"the clips of {video} are replaced" for video in gone)),
         )
 
     def _remove(self, name: str) -> None:

@@ -168,7 +168,9 @@ def test_noise_of_the_brows_is_a_warning(
     assert "the motion of the brows is mostly noise (difference ratio 1.7" in capsys.readouterr().out
 
 
-def test_a_video_becomes_a_speaker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_video_becomes_a_speaker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     write_coded_video(tmp_path / "eva.mp4", pictures(talking(6)))
     words = ["person", "eva.mp4", "-o", "eva.ckpt", "--clip-seconds", "2", "--quiet", "--steps"]
@@ -180,6 +182,10 @@ def test_a_video_becomes_a_speaker(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     before = model.animate(speech, 16_000, seed=0)
     assert before.vertices.shape == (25, 468, 3)
     assert np.isfinite(before.vertices).all()
+    write_coded_video(tmp_path / "other.mp4", pictures(talking(6, seed=3)))
+    assert main(["person", "other.mp4", "--name", "eva", *words[2:], "2"]) == 0  # another video is another training
+    assert "the clips of eva.mp4 are replaced" in capsys.readouterr().out
+    assert not np.array_equal(facediff.load("eva.ckpt").animate(speech, 16_000, seed=0).vertices, before.vertices)
     monkeypatch.setattr("facediff.data.track.recording.FaceTracker", None)  # tracks are there already
     assert main([*words, "4"]) == 0  # goes on
     assert not np.array_equal(facediff.load("eva.ckpt").animate(speech, 16_000, seed=0).vertices, before.vertices)
