@@ -146,14 +146,16 @@ def _own_shapes(glb: Glb) -> OwnShapes:
     vrm: dict[str, list[ShapeBinding]] = defaultdict(list)
     lids: dict[str, list[ShapeBinding]] = defaultdict(list)
     for mesh, index, name in targets:
-        bind, suffix = ShapeBinding(mesh, index), re.split(r"[_.:| ]", name)[-1]
+        bind, suffix, named = ShapeBinding(mesh, index), re.split(r"[_.:| ]", name)[-1], None
         if (shape := arkit_name(name)) is not None:
             arkit[shape].append(bind)
-        elif re.search(r"(?i)viseme|v_", name) or suffix in OCULUS:
+        elif (named := re.search(r"(?i)viseme|v_", name)) or suffix in OCULUS:
             viseme = next((n for n in OCULUS if n.lower() == RENAMED.get(suffix.lower(), suffix.lower())), None)
             if viseme is not None:
                 oculus[viseme].append(bind)
-        elif suffix.lower() in VOWELS and (len(name) == len(suffix) or re.search(r"(?i)mth|mouth|vowel", name)):
+        # Both sets have an E; whichever is whole is the avatar's.
+        alone = len(name) == len(suffix) or re.search(r"(?i)mth|mouth|vowel", name)
+        if shape is None and not named and suffix.lower() in VOWELS and alone:
             vrm[VOWELS[suffix.lower()]].append(bind)
         for side, spellings in LIDS.items():
             if plain(name) in spellings:
@@ -168,7 +170,9 @@ def _own_shapes(glb: Glb) -> OwnShapes:
         "Oculus": len(oculus) >= ENOUGH["Oculus"],
         "VRM": len(vrm) >= ENOUGH["VRM"],
     }
-    kind = next((one for one in sets if has_mouth[one]), None)
+    # A jaw beside visemes is no mouth of ARKit.
+    preferred = sorted(sets, key=lambda one: one == "ARKit" and not any(name.startswith("mouth") for name in arkit))
+    kind = next((one for one in preferred if has_mouth[one]), None)
     if kind is None:
         raise FaceDiffError(
             f"{glb.source}: has no shapes for a mouth under names of ARKit (jawOpen …), Oculus (viseme_aa …) or VRM "

@@ -200,6 +200,9 @@ def test_visemes_are_driven_where_the_avatar_has_no_arkit_mouth(
         "eyeBlinkLeft": "Fcl_EYE_Close",
     }
     write_avatar(tmp_path / "vrm.glb", parts, names=vrm)
+    assert own_shapes(tmp_path / "vrm.glb").binds.keys() >= {*"AIUEO"}
+    write_avatar(tmp_path / "jaw.glb", parts, names={**vrm, "mouthSmileRight": "jawOpen"})
+    assert own_shapes(tmp_path / "jaw.glb").kind == "VRM"  # a jaw alone is no mouth
     assert spoken.values is not None
     truth, space = visemes(spoken.values, layout("arkit"), "vrm")
     drive_avatar(tmp_path / "out.glb", tmp_path / "vrm.glb", spoken)
