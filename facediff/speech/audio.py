@@ -391,9 +391,8 @@ def _track(
 def _first_time(container: Any, sound: float) -> float:  # noqa: ANN401 - PyAV's
     """The time of the first picture; of a file without pictures the zero of its clock, or the sound's own beginning."""
     if container.streams.video:
-        return float(
-            next((video.start_time * video.time_base for video in container.streams.video if video.start_time), 0)
-        )
+        pictures = container.streams.video[0]
+        return float((pictures.start_time or 0) * pictures.time_base)
     zero_based = {"mp4", "matroska", "ogg"} & {*container.format.name.split(",")} and sound < LONGEST_HOLE
     return 0.0 if zero_based else sound
 

@@ -64,6 +64,25 @@ def container(
     return file.getvalue()
 
 
+def test_a_second_track_of_pictures_cuts_no_sound(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "a.mkv"), "w") as out:
+        sound: Any = out.add_stream("pcm_s16le", rate=RATE, layout="mono")
+        films: list[Any] = [out.add_stream("mpeg4", rate=25) for _ in range(2)]
+        packets = []
+        for late, film in zip((0, 25), films, strict=True):
+            film.width = film.height = 32
+            for number in range(late, 50):
+                frame = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8))
+                frame.pts, frame.time_base = number, Fraction(1, 25)
+                packets += film.encode(frame)
+            packets += film.encode(None)
+        piece = av.AudioFrame.from_ndarray((VOICE * 32767).astype(np.int16)[None], format="s16", layout="mono")
+        piece.sample_rate = RATE
+        out.mux([*packets, *sound.encode(piece), *sound.encode(None)])
+    assert like(read_speech(tmp_path / "a.mkv"), VOICE) > 0.999
+
+
 def shifted(flv: bytes, at: float, by: float) -> bytes:
     """The same .flv with its packets of sound from a time on shifted by seconds, also backwards."""
     content, place = bytearray(flv), 13
