@@ -35,6 +35,7 @@ import numpy.typing as npt
 
 from facediff.animation import Animation
 from facediff.animation.animation import MotionMap, stretches_of
+from facediff.errors import FaceDiffError
 from facediff.speech.audio import resampler
 from facediff.utils import SAMPLE_RATE
 from facediff.utils.arrays import ArrayWriter, open_array
@@ -389,6 +390,10 @@ class Decode(Stage):
         return Each(lambda some: self.apply(some, still) if len(some) else replace(some, points=nothing))
 
 
+MOST_BEYOND = 0.5
+"""Seconds by which an alignment may be longer than the speech."""
+
+
 class CloseLips(Stage):
     """Lips touch where the phonemes of an alignment have them touch."""
 
@@ -402,9 +407,16 @@ class CloseLips(Stage):
         from facediff.speech.phonemes import closed_times, phonemes_text, read_alignment
 
         phonemes = read_alignment(self.alignment)
+        end = max((phoneme.end for phoneme in phonemes if phoneme.ipa), default=0.0)
         for sample in take.samples:
-            budget = BUDGET if self.budget is None else self.budget
-            closed = close_lips(sample.animation(), closed_times(phonemes), budget)
+            budget, animation = BUDGET if self.budget is None else self.budget, sample.animation()
+            seconds = len(animation.vertices) / animation.frame_rate
+            if end > seconds + MOST_BEYOND:
+                raise FaceDiffError(
+                    f"{self.alignment}: its last phoneme ends at {end:.1f} s and the speech at {seconds:.1f} s; give "
+                    f"this recording's alignment"
+                )
+            closed = close_lips(animation, closed_times(phonemes), budget)
             sample.settle(replace(closed, metadata={**closed.metadata, PHONEMES: phonemes_text(phonemes)}))
 
 

@@ -25,7 +25,6 @@ from facediff.data import collate
 from facediff.models import DualPathDiffusion, load_model
 from facediff.render import Renderer
 from facediff.render.panels import heat_colours
-from tests.fakes.channels import CHANNELS, TinyChannels, write_channels
 from tests.fakes.tiny import Tiny
 from tests.fakes.wandb_run import OfflineRun
 
@@ -189,22 +188,6 @@ def test_preview_that_fails_warns_and_leaves_nothing_half_written(
     assert not [path for path in tmp_path.rglob("*") if "previews" in str(path)]
 
 
-def test_preview_without_a_mesh_is_reported_once(
-    make_model: MakeModel,
-    make_trainer: MakeTrainer,
-    tiny: Tiny,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(tiny, "mesh_files", ("absent.ply",))
-    make_trainer(max_epochs=2, callbacks=[SamplingPreview(**SMALL)]).fit(make_model(), datamodule=tiny)
-    told = capsys.readouterr().out
-    assert told.count(f"no previews in this run: {tiny.root} holds no mesh to draw (absent.ply)") == 1
-    assert told.count("preview") == 1
-    assert not (tmp_path / "previews").exists()
-
-
 @pytest.mark.slow
 def test_preview_in_wandb_has_videos_and_a_growing_table(
     make_model: MakeModel, make_trainer: MakeTrainer, tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -231,14 +214,3 @@ def test_preview_in_wandb_has_videos_and_a_growing_table(
     rows = [row for table in tables for row in table["data"]]
     assert [row[:2] for row in rows] == [[clip, epoch] for epoch in (1, 2) for clip in CLIPS]
     assert all(row[2]["_type"] == "video-file" and row[4] > 0 for row in rows)
-
-
-def test_preview_of_channels_draws_what_the_rig_makes_of_them(
-    make_model: MakeModel, make_trainer: MakeTrainer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data = TinyChannels(root=str(write_channels(tmp_path / "channels")), batch_size=4)
-    preview = SamplingPreview(**{**SMALL, "clips": 1, "seconds": 0.2})
-    trainer = make_trainer(callbacks=[preview], logger=CSVLogger(tmp_path))
-    trainer.fit(make_model(n_vertices=6, space=CHANNELS), data)
-    assert list(tmp_path.rglob("*.mp4"))
-    assert "no previews" not in capsys.readouterr().out

@@ -69,7 +69,7 @@ def close_lips(animation: Animation, closures: Sequence[tuple[float, float]], bu
     for frame in np.flatnonzero(amounts):
         vertices[frame] -= (amounts[frame] * shape).astype(np.float32)
     moved = float(amounts.max()) * reach
-    note = f"lips closed at {len(bumps)} p, b, m (moved by up to {1000 * moved / metre:.1f} mm)"
+    note = f"lips closed at {bumps.any(axis=1).sum()} p, b, m (moved by up to {1000 * moved / metre:.1f} mm)"
     return with_metadata(animation, vertices, EDITED, note)
 
 
