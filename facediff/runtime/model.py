@@ -125,6 +125,7 @@ class RuntimeModel(ExportedGraphs):
     def animation(self, points: Array, stream: RuntimeStream, audio: Array | None, name: str) -> Animation:
         """Points (T, points, dims) of a stream's face with everything that exporters need."""
         about, arrays, conditions = self.description, self.arrays, stream.conditions
+        face = about.faces[stream.face]
         regions = {
             key.removeprefix("region_"): value.astype(np.int64)
             for key, value in arrays.items()
@@ -135,7 +136,7 @@ class RuntimeModel(ExportedGraphs):
             "model": f"{about.model}, exported in {about.precision}",
             "corpus": f"{about.corpus} (synthetic)" if about.synthetic else about.corpus,
             **about.licences,
-            "identity": about.faces[stream.face],
+            "identity": face if face in about.known else f"{face} (not trained on)",
             **({} if about.style_source == "none" else {"style": conditions.style_name}),
         }
         if about.generation == "sampled":

@@ -163,8 +163,6 @@ def test_other_options_are_refused(tmp_path: Path) -> None:
 
 
 def test_other_regions_replace_those_of_before(tmp_path: Path) -> None:
-    """Clips stay; files that clips share are written as the plan has them now."""
-
     def regions(text: str, out: Path) -> list[str]:
         (out / "lips.txt").write_text(text)
         return ["lips.txt"]
