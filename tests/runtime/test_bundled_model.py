@@ -151,11 +151,9 @@ def test_it_is_written_as_a_folder_and_listed(tmp_path: Path, capsys: pytest.Cap
     assert main(["export-model", "-o", str(folder)]) == 0
     for path in folder.iterdir():
         assert path.read_bytes() == (hub.BUNDLED / path.name).read_bytes()
-    wanted = facediff.load(hub.BUNDLED).animate(SPEECH, identity="M5", seed=1)
-    assert wanted.metadata["identity"] == "M5 (not trained on)"
-    np.testing.assert_array_equal(
-        facediff.load(folder).animate(SPEECH, identity="M5", seed=1).vertices, wanted.vertices
-    )
+    wanted, found = (facediff.load(one).animate(SPEECH, identity="M5", seed=1) for one in (hub.BUNDLED, folder))
+    assert found.metadata["identity"] == "M5 (not trained on)"
+    np.testing.assert_array_equal(found.vertices, wanted.vertices)
     capsys.readouterr()
     assert main(["components", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
