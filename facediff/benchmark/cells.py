@@ -31,7 +31,7 @@ from facediff.benchmark.plan import (
     find_config,
 )
 from facediff.errors import FaceDiffError, check_known
-from facediff.utils.checksums import describe_files, sha256
+from facediff.utils.checksums import describe_files, file_stamps, sha256
 from facediff.utils.files import short_name
 from facediff.utils.hub import check_model_source, model_hash
 from facediff.utils.yaml_files import load_yaml
@@ -155,8 +155,9 @@ def rows_of(plan: BenchmarkPlan) -> list[Row]:
 
 def cells_of(plan: BenchmarkPlan) -> list[Cell]:
     """All cells, seed by seed, so that a plan that is stopped early has complete columns of few seeds."""
+    manifests = {name: _manifest(corpus.root) for name, corpus in plan.corpora.items()}
     columns = [
-        list(_cells(plan, row, corpus))
+        list(_cells(plan, row, corpus, manifests[name]))
         for row in rows_of(plan)
         for name, corpus in plan.corpora.items()
         if row.method.corpora is None or name in row.method.corpora
@@ -164,20 +165,17 @@ def cells_of(plan: BenchmarkPlan) -> list[Cell]:
     return [cell for turn in zip_longest(*columns) for cell in turn if cell is not None]
 
 
-def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[Cell]:
+def _cells(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry, manifest: str) -> Iterator[Cell]:
     method = row.method
     seeds: tuple[int | None, ...] = method.seeds or plan.seeds
     test_options = {**plan.test_options, **method.test_options}
     scoring = {"protocol": plan.protocol, "metrics": list(plan.metrics), "options": test_options}
     data = None if corpus.data is None else config_content(corpus.data)
-    shared = {"corpus": {"data": data, "manifest": _manifest(corpus.root)}}
+    shared = {"corpus": {"data": data, "manifest": manifest}}
     facts: dict[str, Any] = {"test_options": test_options, "root": corpus.root, "data": corpus.data}
     if method.config is not None:
         trainings = tuple(_trainings(plan, row, corpus))
-        steps = [
-            {"name": step.name, "config": config_content(step.config), "options": dict(step.options)}
-            for step in trainings
-        ]
+        steps = [training_content(step) for step in trainings]
         for seed in seeds:
             trained = with_code({**shared, "seed": seed, "threads": plan.threads, "trainings": steps})
             recipe = with_code({"kind": "fit", "trained": trained, "weights": plan.weights, "test": scoring})
@@ -234,8 +232,13 @@ def _manifest(root: Path | None) -> str:
         return "none"
     if (manifest := root / "manifest.json").is_file():
         return sha256(manifest)
-    files = sorted((str(path.relative_to(root)), path.stat()) for path in root.rglob("*") if path.is_file())
-    return hash_of([(name, status.st_size, status.st_mtime_ns) for name, status in files])
+    return hash_of(file_stamps(root))
+
+
+def training_content(training: Training) -> dict[str, Any]:
+    """All that a training's config and options say, with the content of the files that they name."""
+    config, options = config_content(training.config), dict(training.options)
+    return dict(_with_files({"name": training.name, "config": config, "options": options}, Path()))
 
 
 def config_content(path: Path) -> Any:  # noqa: ANN401

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from facediff.benchmark.cells import Cell, Training, config_content, hash_of, with_code
+from facediff.benchmark.cells import Cell, Training, hash_of, training_content, with_code
 from facediff.benchmark.results import Result, cell_file, model_result, predictions_result, read_result
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
@@ -228,11 +228,12 @@ def fit_options(training: Training, checkpoints: Mapping[str, Path], cell: Cell)
 
 
 def refuse_changed(training: Training, cell: Cell) -> None:
-    """Refuse a config or code edited since the cells were made: the result would bear the hash of the old content."""
-    (hashed,) = (entry["config"] for entry in cell.trained["trainings"] if entry["name"] == training.name)
-    if hash_of(config_content(training.config)) != hash_of(hashed) or with_code(cell.trained) != cell.trained:
+    """Refuse files or code edited since the cells were made: the result would bear the hash of the old content."""
+    (hashed,) = (entry for entry in cell.trained["trainings"] if entry["name"] == training.name)
+    if hash_of(training_content(training)) != hash_of(hashed) or with_code(cell.trained) != cell.trained:
         raise FaceDiffError(
-            f"{cell}: {training.config} or its code was changed while the benchmark ran; run the benchmark again"
+            f"{cell}: {training.config}, a file of its options or its code was changed while the benchmark ran; run "
+            f"the benchmark again"
         )
 
 

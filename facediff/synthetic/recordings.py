@@ -21,6 +21,7 @@ from facediff.speech.text_grids import REMEDY, SILENCES, WORDS, find_tier, phone
 from facediff.synthetic.cast import ALIGNED
 from facediff.synthetic.voices import CMU_PHONES, Delivery, Synthesiser
 from facediff.utils import SAMPLE_RATE
+from facediff.utils.checksums import file_stamps
 
 SOUNDS = (".wav", ".flac")
 LONGEST = 12.0  # Seconds of a recording that a corpus takes
@@ -79,11 +80,10 @@ def speakers_of(folder: Path) -> tuple[str, ...]:
 
 
 def state_of(people: Sequence[str]) -> str:
-    """A hash of the names, sizes and times of all recordings and TextGrids of people's voices; empty without any."""
+    """A hash of the paths, sizes and times of all recordings and TextGrids of people's voices; empty without any."""
     folders = [Path(voice.removeprefix(f"{ALIGNED}:")) for voice in people if voice.startswith(f"{ALIGNED}:")]
-    files = sorted((str(path), path.stat()) for folder in folders for path in folder.rglob("*.*"))
-    facts = [(name, status.st_size, status.st_mtime_ns) for name, status in files]
-    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16] if facts else ""
+    stamps = [file_stamps(folder) for folder in folders]
+    return hashlib.sha256(repr(stamps).encode()).hexdigest()[:16] if stamps else ""
 
 
 def recordings_of(speaker: str, count: int) -> list[Recording]:

@@ -33,6 +33,12 @@ def describe_files(
     return {name: {"bytes": (folder / name).stat().st_size, "sha256": digests[name]} for name in ordered}
 
 
+def file_stamps(folder: Path) -> list[tuple[str, int, int]]:
+    """Path, size and time of every file below a folder, sorted: they tell a change without reading the files."""
+    files = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
+    return sorted((path.relative_to(folder).as_posix(), stat.st_size, stat.st_mtime_ns) for path, stat in files)
+
+
 def same_sizes(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> bool:
     """Whether all files that a manifest describes are there with their sizes; their content is not read."""
     try:
