@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -110,6 +109,7 @@ def person(
     from facediff.data import People
     from facediff.data.check import check
     from facediff.data.track.corpus import find_videos, track_people
+    from facediff.utils.checksums import sha256
 
     started, root = time.monotonic(), corpus or output.with_name(f"{output.stem}_corpus")
     videos = find_videos(video, name)
@@ -128,8 +128,7 @@ def person(
         data = People(root=str(root))
         options = ["--config", CONFIG, f"--data.root={root}", f"--trainer.max_steps={steps}", *ONE_PERSON]
         # A stopped training of these clips and steps goes on; another video is another training.
-        facts = b"".join((root / name).read_bytes() for name in ("manifest.json", "clips.csv"))
-        training = f".training/{hashlib.sha256(facts + str(steps).encode()).hexdigest()[:8]}"
+        training = f".training/{sha256(root / 'manifest.json')[:8]}_{steps}"
         options += [f"--trainer.logger.save_dir={root}", f"--trainer.logger.name={training}"]
         options += [] if data.clips("val") else ["--trainer.limit_val_batches=0"]
         options += ["--ckpt_path", "last"] if any((root / training).glob(f"*/{LAST}")) else []
