@@ -146,10 +146,11 @@ def _own_shapes(glb: Glb) -> OwnShapes:
     vrm: dict[str, list[ShapeBinding]] = defaultdict(list)
     lids: dict[str, list[ShapeBinding]] = defaultdict(list)
     for mesh, index, name in targets:
-        bind, suffix, named = ShapeBinding(mesh, index), re.split(r"[_.:| ]", name)[-1], None
+        bind, suffix = ShapeBinding(mesh, index), re.split(r"[_.:| ]", name)[-1]
+        named = re.search(r"(?i)viseme|v_", name)
         if (shape := arkit_name(name)) is not None:
             arkit[shape].append(bind)
-        elif (named := re.search(r"(?i)viseme|v_", name)) or suffix in OCULUS:
+        elif named or suffix in OCULUS:
             viseme = next((n for n in OCULUS if n.lower() == RENAMED.get(suffix.lower(), suffix.lower())), None)
             if viseme is not None:
                 oculus[viseme].append(bind)
@@ -171,8 +172,9 @@ def _own_shapes(glb: Glb) -> OwnShapes:
         "VRM": len(vrm) >= ENOUGH["VRM"],
     }
     # A jaw beside visemes is no mouth of ARKit.
-    preferred = sorted(sets, key=lambda one: one == "ARKit" and not any(name.startswith("mouth") for name in arkit))
-    kind = next((one for one in preferred if has_mouth[one]), None)
+    kinds: tuple[Kind, ...] = ("Oculus", "VRM")
+    order = ("ARKit", *kinds) if any(name.startswith("mouth") for name in arkit) else (*kinds, "ARKit")
+    kind = next((one for one in order if has_mouth[one]), None)
     if kind is None:
         raise FaceDiffError(
             f"{glb.source}: has no shapes for a mouth under names of ARKit (jawOpen …), Oculus (viseme_aa …) or VRM "
