@@ -408,15 +408,14 @@ class CloseLips(Stage):
 
         phonemes = read_alignment(self.alignment)
         end = max((phoneme.end for phoneme in phonemes if phoneme.ipa), default=0.0)
+        if end > take.recording.seconds + MOST_BEYOND:
+            raise FaceDiffError(
+                f"{self.alignment}: its last phoneme ends at {end:.1f} s and the speech at "
+                f"{take.recording.seconds:.1f} s; give this recording's alignment"
+            )
         for sample in take.samples:
-            budget, animation = BUDGET if self.budget is None else self.budget, sample.animation()
-            seconds = len(animation.vertices) / animation.frame_rate
-            if end > seconds + MOST_BEYOND:
-                raise FaceDiffError(
-                    f"{self.alignment}: its last phoneme ends at {end:.1f} s and the speech at {seconds:.1f} s; give "
-                    f"this recording's alignment"
-                )
-            closed = close_lips(animation, closed_times(phonemes), budget)
+            budget = BUDGET if self.budget is None else self.budget
+            closed = close_lips(sample.animation(), closed_times(phonemes), budget)
             sample.settle(replace(closed, metadata={**closed.metadata, PHONEMES: phonemes_text(phonemes)}))
 
 
