@@ -6,8 +6,8 @@
 
 people needs Google's model of a face ($FACEDIFF_FACE_MODEL, docs/own_data.md).
 
-Not made here: export_blender.png, live_path.svg and architecture.svg, which were drawn by hand or by programs of
-version 1.1.0.
+Not made here: live_path.svg and architecture.svg, which were drawn by hand, and export_blender.png, by
+tools/blender_check.py of version 1.1.0.
 """
 
 from __future__ import annotations

@@ -48,6 +48,7 @@ def test_a_head_from_elsewhere_speaks_or_is_refused(animation: Animation, name: 
     mesh = Mesh(head.vertices, head.faces.astype(np.int32))
     found = correspond(animation.template, animation.triangles, head.vertices, head.faces)
     made, found, report = transfer_checked(animation, found, mesh)
+    print(f"{name}, {len(head.vertices)} vertices: {report.summary}")  # rows of docs/own_mesh.md
     assert report.good == (head.alive and name not in RAGGED), report.faults
     if not report.good:
         return
