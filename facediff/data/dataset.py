@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -258,10 +259,16 @@ class ResumableLoader(DataLoader[list[Sample]]):
     def state_dict(self) -> dict[str, int]:
         """What Lightning stores in a checkpoint."""
         epoch, batches = self.progress()
-        return {"epoch": epoch, "batches": batches, "seed": getattr(self.sampler, "seed", 0)}
+        return {"epoch": epoch, "batches": batches, "of": len(self), "seed": getattr(self.sampler, "seed", 0)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Continue there."""
+        if state["batches"] and state.get("of", len(self)) != len(self):
+            warnings.warn(
+                f"the checkpoint is of the middle of an epoch of {state['of']} batches, now of {len(self)}: clips are "
+                "repeated or left out in the rest of it",
+                stacklevel=2,
+            )
         if isinstance(self.sampler, ResumableBatches):
             self.sampler.seed = state["seed"]  # a config may leave the seed to chance
             self.sampler.resume(state["epoch"], state["batches"])

@@ -145,6 +145,8 @@ def test_only_the_epoch_that_was_stopped_is_continued_within(tiny_root: Path) ->
     assert [batch.names for batch in loader] == whole[1][2:]
     loader.sampler.set_epoch(2)
     assert [batch.names for batch in loader] == whole[2]
+    with pytest.warns(UserWarning, match=r"epoch of 9 batches, now of .: clips are repeated"):
+        loader.load_state_dict({"epoch": 1, "batches": 2, "of": 9, "seed": 0})
 
 
 def test_unknown_people_have_identity_minus_one(tiny: Tiny) -> None:
