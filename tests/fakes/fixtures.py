@@ -141,18 +141,18 @@ def ctc_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return saved(Wav2Vec2ForCTC, config, tmp_path_factory.mktemp("ctc"))
 
 
+def installed(found: Path | None, name: str) -> Path:
+    """What was found; otherwise the test is skipped, or fails where FACEDIFF_REQUIRE_BROWSER is set."""
+    if found is None:
+        end = pytest.fail if os.environ.get("FACEDIFF_REQUIRE_BROWSER") else pytest.skip
+        end(f"no {name} found: run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)")
+    return found
+
+
 @pytest.fixture(scope="session")
 def program() -> Path:
-    """A Chromium; without one the test is skipped, or fails where FACEDIFF_REQUIRE_BROWSER is set."""
-    found = find_chromium()
-    if found is None:
-        words = (
-            "no Chromium found: put one on the PATH, or run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)"
-        )
-        if os.environ.get("FACEDIFF_REQUIRE_BROWSER"):
-            pytest.fail(words)
-        pytest.skip(words)
-    return found
+    """A Chromium."""
+    return installed(find_chromium(), "Chromium")
 
 
 @pytest.fixture(scope="session")
@@ -163,12 +163,7 @@ def browser(program: Path) -> Iterator[Chromium]:
 
 @pytest.fixture(scope="session")
 def web_runtime_package(program: Path) -> Path:
-    """ONNX Runtime for browsers, which the browser's installation brings along; skipped or failed as the browser."""
+    """ONNX Runtime for browsers, which the browser's installation brings along."""
     name = f"onnxruntime-web-{VERSION}.tgz"
-    found = next((path for path in (program.parent / name, program.parent.parent / name) if path.is_file()), None)
-    if found is None:
-        words = f"no {name} next to the browser: run  export FACEDIFF_CHROMIUM=$(tools/browser/install.sh DIR)"
-        if os.environ.get("FACEDIFF_REQUIRE_BROWSER"):
-            pytest.fail(words)
-        pytest.skip(words)
-    return found
+    places = (folder / name for folder in (program.parent, program.parent.parent))
+    return installed(next((path for path in places if path.is_file()), None), name)
