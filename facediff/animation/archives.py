@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from facediff.animation.animation import Animation, Channels, MotionMap, stretches_of
 from facediff.errors import FaceDiffError, OptionError, check_known, located
+from facediff.mesh.alignment import face_size, robust_align
 from facediff.spaces import Space
 from facediff.utils.arrays import open_vertices, read_arrays, write_header
 from facediff.utils.files import atomic
@@ -100,6 +101,14 @@ def read_animation(
         raise OptionError.naming(f"{path}: an array has no frame rate; give {{frame_rate}} or {{checkpoint}}")
     if "template" not in facts:
         facts = {**facts, "template": np.array(vertices[0], np.float32)}
+    elif vertices.shape[1:] == facts["template"].shape and np.isfinite(vertices[0]).all():
+        laid = robust_align(vertices[0], facts["template"], scale=True)
+        apart = np.median(np.linalg.norm(laid.apply(vertices[0]) - facts["template"], axis=-1))
+        if not (0.5 < laid.scale < 2 and apart < 0.3 * face_size(facts["template"])):
+            raise FaceDiffError(
+                f"{path}: its first frame does not lie on the neutral face, which is {laid.scale:.3g} times as large; "
+                "expected absolute vertices in the order and unit of the mesh"
+            )
     with located(path):
         return Animation(name=path.stem, vertices=vertices, **facts)
 

@@ -41,9 +41,12 @@ class EmaWithWarmup(WeightAveraging):
         warmup: Annotated[float, Range(1, 1e9)] = 10.0,
         device: str | None = None,
     ) -> None:
-        self.decay = decay
-        self.warmup = warmup
-        super().__init__(device=device, use_buffers=False, multi_avg_fn=self.average)
+        self.decay, self.warmup, self.device = decay, warmup, device
+        self.begin()
+
+    def begin(self) -> None:
+        """Know nothing of earlier runs."""
+        super().__init__(device=self.device, use_buffers=False, multi_avg_fn=self.average)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Copy the whole model; its own set-up by the corpus comes later."""
@@ -57,12 +60,17 @@ class EmaWithWarmup(WeightAveraging):
         data = getattr(trainer, "datamodule", None)
         if stage == "fit" and isinstance(pl_module, AnimationModel) and isinstance(data, SpeechMotionDataModule):
             pl_module.make_parts(data.assets())
+        self.begin()
         super().setup(trainer, pl_module, stage)
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Continue averaging in training; scores and predictions are of the average, which the model has loaded."""
         if trainer.state.fn == TrainerFn.FITTING:
             super().on_load_checkpoint(trainer, pl_module, checkpoint)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave the average, also where a checkpoint left nothing to train."""
+        self.on_train_end(trainer, pl_module)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Validate the average during training; otherwise the model has the weights to be validated."""

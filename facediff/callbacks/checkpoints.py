@@ -127,6 +127,7 @@ class LastCheckpoint(Callback):
         """Become the first callback."""
         callbacks = [callback for callback in trainer.callbacks if callback is not self]  # type: ignore[attr-defined]
         trainer.callbacks = [self, *callbacks]  # type: ignore[attr-defined]
+        self._saved_step, self._seconds, self._resumed = -1, 0.0, {}  # of this run
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock, and let signals wait."""

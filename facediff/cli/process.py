@@ -5,7 +5,6 @@ A command is stopped by an exception in any case, so that half-written files are
 
 from __future__ import annotations
 
-import datetime  # noqa: F401 - before NumPy, which makes an ImportError of a Ctrl-C that comes while it imports this
 import errno
 import io
 import os

@@ -677,8 +677,9 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         batches = trainer.fit_loop.epoch_loop.batch_progress.current
         if epochs.started <= epochs.processed:  # between two epochs
             return epochs.processed, 0
-        at_end = batches.completed >= trainer.num_training_batches
-        return (epochs.processed + 1, 0) if at_end else (epochs.processed, batches.completed)
+        # Not `completed`, which a checkpoint at the end of a batch is written before.
+        at_end = batches.processed >= trainer.num_training_batches
+        return (epochs.processed + 1, 0) if at_end else (epochs.processed, batches.processed)
 
     def _loader_options(self) -> dict[str, Any]:
         return {

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions, Up
 from facediff.errors import FaceDiffError
+from facediff.mesh import read_mesh
 from facediff.mesh.textures import Textures, read_textures
 from facediff.render.meshes import face_outward, vertex_normals
 from facediff.utils.colours import to_linear
@@ -153,7 +154,16 @@ def facts(animation: Animation, space: FileSpace) -> dict[str, object]:
 
 def surface_of(animation: Animation, options: ExportOptions) -> Textures | None:
     """The texture coordinates and materials that the options ask for."""
-    return None if options.surface is None else read_textures(Path(options.surface), len(animation.triangles))
+    if options.surface is None:
+        return None
+    path = Path(options.surface)
+    surface = read_textures(path, len(animation.triangles))
+    if not np.array_equal(np.sort(read_mesh(path).faces), np.sort(animation.triangles)):
+        raise FaceDiffError(
+            f"{path}: its triangles are not the animation's, or in another order; give the file of that mesh, written "
+            "with the order of its faces kept"
+        )
+    return surface
 
 
 def outward(animation: Animation) -> npt.NDArray[np.int32]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from facediff import registry
 from facediff.animation import Animation, metres_per_unit
 from facediff.animation.options import ExportOptions
-from facediff.errors import FaceDiffError, MissingExtraError, OptionError, check_known
+from facediff.errors import FaceDiffError, MissingExtraError, OptionError, check_known, refuse_idle
 from facediff.export.format import MARK, Format, check_animation, folder_of, speech_wav
 from facediff.export.sequences import RECORD
 from facediff.mesh.textures import has_textures
@@ -83,6 +83,14 @@ def write_animations(
         if "surface" in form.uses and options.surface is None and has_textures(into):
             options = replace(options, surface=into)
         into = None
+    if into is not None:
+        refuse_idle(
+            "has no effect on a copy of the target .glb",
+            shapes=options.shapes is not None,
+            surface=options.surface is not None,
+            key_tolerance=options.key_tolerance != ExportOptions.key_tolerance,
+            tolerance=own_shapes and options.tolerance != ExportOptions.tolerance,
+        )
     for animation in animations:
         check_animation(animation, needs_mesh=form.needs_mesh)
     targets = _targets(path, form, len(animations))

@@ -103,6 +103,18 @@ def hands_on_textures(path: Path, output: Path) -> bool:
     return not (path.suffix.lower() == output.suffix.lower() == ".glb") and has_textures(path)
 
 
+def mesh_files(path: Path) -> list[Path]:
+    """A mesh file, and of an .obj the material files and pictures that it names."""
+    found = [path]
+    for file in found:  # which grows: a material file names pictures
+        if file.suffix.lower() in (".obj", ".mtl"):
+            for line in file.read_bytes().decode("utf-8-sig", errors="replace").splitlines():
+                word, _, rest = line.strip().replace("\t", " ").partition(" ")
+                if word in ("mtllib", "map_Kd") and (beside := _beside(path, _file_name(rest))) not in (None, *found):
+                    found.append(beside)
+    return found
+
+
 def read_textures(path: Path, n_triangles: int) -> Textures:
     """Texture coordinates and materials of an .obj or .glb."""
     reader = {".glb": _read_glb, ".obj": _read_obj}.get(path.suffix.lower()) if path.is_file() else None
@@ -178,8 +190,7 @@ def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str,
             elif word == "Kd" and name:
                 result[name] = Material(name, _colour(rest), result[name].picture)
             elif word == "map_Kd" and name:
-                # Options such as -o 0 0 0 stand before the name, which may have spaces.
-                text = rest.split()[-1] if rest.strip().startswith("-") else rest.strip()
+                text = _file_name(rest)
                 if text not in pictures:
                     beside = _beside(path, text)
                     pictures[text] = beside if beside is not None and _is_picture(beside) else None
@@ -204,6 +215,11 @@ def _colour(text: str) -> tuple[float, float, float]:
     except ValueError:
         return Material("").colour
     return red, green, blue
+
+
+def _file_name(rest: str) -> str:
+    # Options such as -o 0 0 0 stand before the name, which may have spaces.
+    return rest.split()[-1] if rest.strip().startswith("-") else rest.strip()
 
 
 def _beside(path: Path, name: str) -> Path | None:

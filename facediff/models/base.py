@@ -410,6 +410,8 @@ class AnimationModel(CheckpointContent, ABC):
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
         """Take a corpus's assets, and measure what training needs of it."""
+        # Another model may have set these before.
+        data.features.reader, data.pair_sentences, data.aligner, data.window_context = None, False, None, (0, 0)
         if stage != "predict":
             _ = self.evaluation  # an unknown protocol or metric is reported before the corpus is read
         if stage == "fit":
@@ -469,6 +471,8 @@ class AnimationModel(CheckpointContent, ABC):
         """Say in which form training motion is wanted, before the first clip is read."""
         data = getattr(self.trainer, "datamodule", None)
         if isinstance(data, SpeechMotionDataModule):
+            # Options of the data that a resume changes apply to the losses too, in place of the checkpoint's.
+            self.adopt(data.assets().with_motion_scale(self.assets.motion_scale))
             data.projection.choose(self.training_projection())
 
     def training_projection(self) -> Projection | None:

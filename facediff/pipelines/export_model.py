@@ -381,6 +381,7 @@ def describe(
         style_source=graphs.style,
         longest=graphs.longest,
         stillness=stillness.size if stillness else 0.0,
+        usual_expressivity=float(model.expressivity),
         voice_gate=model.usual_gate,
         space={} if assets.space.is_vertices else assets.space.state(),
         **{name: value for name, value in vars(graphs.sampling or NO_LOOP).items() if name != "noise"},

@@ -49,7 +49,7 @@ class ExportedPipeline(AnimationPipeline):
             "identity": options.identity,
             "condition": options.condition,
             "style": lively if options.alive and options.style is None and lively in about.styles else options.style,
-            "expressivity": factors.get("all", 1.0),
+            "expressivity": factors.get("all"),
         }
         stream = self.model.stream(seed=options.seed or 0, **self._chosen)
         still = self.model.still(stream)

@@ -45,6 +45,7 @@ class ExportedModel(AnimationModel):
             n_vertices=points, identities=assets.identities, frame_rate=about.frame_rate, space=about.motion_space
         )
         model.runtime = runtime
+        model.expressivity = about.usual_expressivity
         model.samples = about.generation == "sampled"  # type: ignore[misc]  # of each folder
         model.sampler = f"{about.sampler} with {counted(len(runtime.loop), 'step')}"
         model.windows = WindowPlan(above=math.inf)  # the folder's own plan cuts speech

@@ -18,6 +18,7 @@ from facediff.animation.styles import style_paths
 from facediff.editing.controls import keys_file
 from facediff.errors import FaceDiffError, OptionError, check_known, printable
 from facediff.export import FORMATS, check_export
+from facediff.mesh.textures import mesh_files
 from facediff.pipelines.animate import check_options
 from facediff.pipelines.trained import open_pipeline
 from facediff.speech.audio import read_recording
@@ -110,13 +111,15 @@ def _deciding_files(options: AnimationOptions, export: ExportOptions) -> list[Pa
     inside = sorted(path for path in source.iterdir() if path.is_file()) if is_exported(source) else model_files(source)
     files = [*inside, *style_paths(None if options.style is None else str(options.style))]
     optional = (
-        options.target_mesh,
+        options.mesh,
         options.eyes,
         options.correspondence,
         options.style_template,
         keys_file(options.direction),
     )
     files += [Path(path) for path in optional if path is not None and Path(path).is_file()]
+    for path in (options.target_mesh, export.surface):
+        files += mesh_files(Path(path)) if path is not None and Path(path).is_file() else []
     shapes = None if export.shapes is None else Path(export.shapes)
     if shapes is not None and shapes.exists():
         inside = sorted(shapes.iterdir()) if shapes.is_dir() else [shapes]

@@ -26,7 +26,7 @@ from facediff.utils.arrays import read_arrays
 from facediff.utils.files import atomic_folder
 from facediff.utils.limits import quoted
 from facediff.utils.plain_files import load_json
-from facediff.utils.ranges import Range
+from facediff.utils.ranges import Expressivity, Range
 from facediff.utils.records import read_record
 
 FORMAT = "facediff model"
@@ -85,6 +85,7 @@ class Description:
     # How far the stored references move; reference motion is rejected as another face if its static vertices (the array
     # still) deviate by more than a fraction of this.
     stillness: float = 0.0
+    usual_expressivity: Expressivity = 1.0  # unless another is asked for
     quick_steps: Sequence[int] = ()  # visited at low latency; none where the model does not change its steps
     quick_table: Sequence[Sequence[float]] = ()
     voice_gate: Literal["energy", "off"] = "energy"  # the default; off for imported models

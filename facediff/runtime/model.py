@@ -7,6 +7,7 @@ model by :mod:`facediff.pipelines`, so that most programs want :func:`facediff.l
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -137,6 +138,7 @@ class RuntimeModel(ExportedGraphs):
             "corpus": f"{about.corpus} (synthetic)" if about.synthetic else about.corpus,
             **about.licences,
             "identity": face if face in about.known else f"{face} (not trained on)",
+            **({} if (condition := conditions.choices.condition) is None else {"condition": condition}),
             **({} if about.style_source == "none" else {"style": conditions.style_name}),
         }
         if about.generation == "sampled":
@@ -168,6 +170,7 @@ class RuntimeModel(ExportedGraphs):
     def _face(self, choice: RuntimeChoices) -> tuple[int, RuntimeConditions]:
         """The face's place among the templates, and the conditions of its motion."""
         about, style = self.description, choice.style
+        choice = replace(choice, expressivity=about.usual_expressivity) if choice.expressivity is None else choice
         identity = about.known[0] if choice.identity is None else choice.identity
         check_known("{identity}", "identity", [identity], about.faces)
         if choice.condition is not None:

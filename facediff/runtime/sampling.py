@@ -32,14 +32,14 @@ class RuntimeChoices:
         condition: the training identity that the model is conditioned on, if it differs from the face's.
         style: as :func:`~facediff.runtime.styles.style_from` takes it; the face's own if None.
         seed: seed of the noise; equal seeds give the motion of PyTorch's processor.
-        expressivity: from the mean prediction (0) to a sample (1) and beyond (2).
+        expressivity: from the mean prediction (0) to a sample (1) and beyond (2); the folder's if None.
     """
 
     identity: str | None = None
     condition: str | None = None
     style: Any = None
     seed: int = 0
-    expressivity: float = 1.0
+    expressivity: float | None = None
 
 
 @dataclass(frozen=True)

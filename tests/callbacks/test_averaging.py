@@ -88,3 +88,6 @@ def test_scores_of_a_checkpoint_by_path_are_those_of_the_average(
                 model.network.unembed.weight.zero_()
             scored(model, datamodule=tiny, ckpt_path=path)
             assert all(torch.equal(model.state_dict()[name], value) for name, value in average.items()), scored
+    trainer.save_checkpoint(tmp_path / "best.ckpt")
+    saved = torch.load(tmp_path / "best.ckpt", weights_only=True)["state_dict"]
+    assert all(torch.equal(saved[name], value) for name, value in average.items())

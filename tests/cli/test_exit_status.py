@@ -76,27 +76,6 @@ def test_signals_remove_what_is_half_written(number: signal.Signals, status: int
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ctrl_c_while_numpy_is_loaded_is_no_import_error() -> None:
-    """The C code of NumPy says that datetime cannot be imported where Ctrl-C comes while it does so."""
-    script = """
-import sys
-
-from facediff.cli import app
-
-
-class Interrupting:
-    def find_spec(self, name, path=None, target=None):
-        if name == "datetime":
-            raise KeyboardInterrupt
-
-
-sys.meta_path.insert(0, Interrupting())
-assert "numpy" not in sys.modules
-import numpy
-"""
-    subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True)
-
-
 class CudaError(RuntimeError):
     """As torch raises it."""
 
@@ -153,17 +132,3 @@ def test_the_line_of_an_unexpected_error_may_be_in_a_file_of_the_users(
     assert "unexpected KeyError: 'weights'" in printed
     assert f"{__file__}, line " in printed
     assert "fault of facediff" not in printed
-
-
-def test_an_interruption_that_a_library_wraps_is_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(name: str, arguments: object) -> int:
-        try:
-            raise KeyboardInterrupt
-        except KeyboardInterrupt as error:
-            raise ImportError("a library could not be loaded") from error
-
-    monkeypatch.setattr(app, "run", run)
-    assert main(["demo"]) == 130
-    assert "interrupted" in capsys.readouterr().err

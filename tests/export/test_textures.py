@@ -18,7 +18,7 @@ from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import open_glb
-from facediff.mesh.textures import read_textures
+from facediff.mesh.textures import mesh_files, read_textures
 from tests.fakes.avatar import write_avatar
 from tests.fakes.glb_targets import pack
 
@@ -154,6 +154,11 @@ def test_the_commands_take_the_surface(
     assert b"TEXCOORD_0" in (tmp_path / "b.glb").read_bytes()
     assert main(["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / "b.ply"), "--surface", str(source)]) == 2
     assert "--surface" in capsys.readouterr().err
+    assert [file.name for file in mesh_files(source)] == ["mine.obj", "mine.mtl", "skin.png"]
+    *others, last = source.read_text().splitlines()
+    source.write_text("\n".join([*others[:-1], last, others[-1]]))
+    assert main(["export", str(tmp_path / "a.npz"), "-o", str(tmp_path / "b.glb"), "--surface", str(source)]) == 2
+    assert "another order" in capsys.readouterr().err
 
 
 def test_coordinates_and_materials_after_a_tab_are_read_too(source: Path) -> None:

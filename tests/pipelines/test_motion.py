@@ -223,13 +223,16 @@ def test_a_poor_fit_is_refused_as_by_the_command(
         anim.retarget("face.ply")
     anim.retarget("face.ply", correspondence="map.npz", accept_poor=True)
     assert len(anim.retarget("face.ply", correspondence="map.npz").vertices), "accepted when it was made"
+    np.save("bare.npy", anim.vertices[:, ::-1])
+    with pytest.raises(facediff.FaceDiffError, match=r"bare\.npy: its first frame does not lie on the neutral face"):
+        facediff.read("bare.npy", mesh="face.ply", frame_rate=25)
 
 
 @pytest.mark.parametrize("seconds", [0.5, 1.0, 3.0])
 def test_speech_of_another_length_is_told(seconds: float, tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((25, 4, 3), np.float32))
+    rest, faces = np.eye(4, 3, dtype=np.float32), np.array([[0, 1, 2], [0, 2, 3]])
+    np.save(tmp_path / "a.npy", np.stack([rest] * 25))
     soundfile.write(tmp_path / "a.wav", np.full(round(16_000 * seconds), 0.1), 16_000)
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    like = facediff.Animation("like", np.zeros((1, 4, 3), np.float32), np.zeros((4, 3), np.float32), 25.0, faces=faces)
+    like = facediff.Animation("like", rest[None], rest, 25.0, faces=faces)
     with pytest.warns(Note, match="lasts 1.00 s and") if seconds != 1 else nullcontext():
         facediff.read(tmp_path / "a.npy", like=like, speech=tmp_path / "a.wav")

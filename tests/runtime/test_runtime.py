@@ -106,8 +106,8 @@ def test_a_sampler_that_is_not_declared_linear_is_told_how() -> None:
 
 @pytest.fixture(scope="module")
 def model(tiny_root: Path) -> AnimationModel:
-    """A tiny trained-like model with every part that an export has."""
-    return ready(tiny_root)
+    """A tiny trained-like model with every part that an export has, and an expressivity of its own."""
+    return ready(tiny_root, expressivity=0.8)
 
 
 def ready(root: Path, **options: object) -> AnimationModel:

@@ -15,21 +15,12 @@ HUGE = 10**6000
 """More digits than Python agrees to write."""
 
 
-@pytest.mark.parametrize("value", [25, 25.0, np.float32(25), np.int64(25), 0.1, 1000])
-def test_number_in_range_is_returned(value: object) -> None:
-    assert check_number("m.json", "frame_rate", value, *FRAME_RATES) == value
-
-
-@pytest.mark.parametrize(
-    "value", [math.nan, math.inf, -math.inf, True, "25", None, HUGE, -HUGE, 0, 1e-300, 1e9, [25], 1j, b"25"], ids=quoted
-)
-def test_number_that_is_none_or_out_of_range_is_refused(value: object) -> None:
-    with pytest.raises(FaceDiffError, match=r"m.json: frame_rate .* from 0.1 to 1000; write it again") as refused:
-        check_number("m.json", "frame_rate", value, *FRAME_RATES, remedy="write it again")
-    assert len(str(refused.value)) < 200
-
-
-def test_number_of_a_table_may_be_text_and_must_be_whole_where_asked() -> None:
+def test_numbers_of_files() -> None:
+    """Those of a table may be text."""
+    assert check_number("m.json", "frame_rate", np.float32(25), *FRAME_RATES) == 25
+    for value in (math.nan, True, "25", None, HUGE, 0, 1e9, [25], 1j, b"25"):
+        with pytest.raises(FaceDiffError, match=r"m.json: frame_rate .{,80} from 0.1 to 1000; write it again"):
+            check_number("m.json", "frame_rate", value, *FRAME_RATES, remedy="write it again")
     assert check_number("a.csv", "start", " 1.5", 0, text=True) == 1.5
     assert check_number("a.csv", "row", "3", 0, 9, text=True, whole=True) == 3
     for text, whole in (("1.5", True), ("nan", False), ("1e999", False), ("", False), ("9" * 5000, False)):

@@ -26,6 +26,7 @@ from facediff.data import Batch, SpeechMotionDataModule
 from facediff.errors import FaceDiffError, OptionError, check_known
 from facediff.models.audio_encoders import AudioEncoderFactory, StepRule
 from facediff.models.evaluation import IdentityPolicy
+from facediff.models.graphs import Graphs
 from facediff.models.inference import BatchMotion, Progress, Style, with_speech
 from facediff.models.layers import Heads, Share, Width, check_heads, exporting, frame_mask
 from facediff.models.published.autoregressive import PeriodicDecoder
@@ -212,6 +213,10 @@ class UniTalker(DirectModel):
             clip = self.in_windows(batch.select([row]))  # at rates such as 29.97, a frame more or less by rounding
             motion[row, :count] = clip[torch.arange(count).clamp_max(len(clip) - 1)]
         return motion
+
+    def graphs(self) -> Graphs:
+        """The published windows of long speech are no part of the graphs."""
+        return replace(super().graphs(), longest=round(WINDOW * self.frame_rate))
 
     def standardised(self, batch: Batch) -> Batch:
         """Speech as the published code hands it on: standardised here, and again by the speech network.

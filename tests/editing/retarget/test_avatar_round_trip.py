@@ -11,7 +11,8 @@ import pytest
 
 from facediff.animation import Animation, write_archive
 from facediff.cli.app import main
-from facediff.export import write_animations
+from facediff.errors import FaceDiffError
+from facediff.export import ExportOptions, write_animations
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import Glb, has_materials_or_targets
@@ -194,6 +195,8 @@ def test_the_command_writes_into_the_avatar_unless_the_bare_face_is_asked_for(
     assert main([*words, "-o", str(source)]) == 2
     write_animations(tmp_path / "into.glb", [talk(source, parts)], into=source)
     assert opened(tmp_path / "into.glb").content["images"] == had["images"]
+    with pytest.raises(FaceDiffError, match=r"no effect on a copy of the target \.glb"):
+        write_animations(tmp_path / "b.glb", [talk(source, parts)], ExportOptions(key_tolerance=0.3), into=source)
     assert not has_materials_or_targets(tmp_path / "talk.npz")
 
 

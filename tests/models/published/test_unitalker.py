@@ -146,7 +146,9 @@ def test_long_speech_is_standardised_and_again_in_each_window(kind: str, tmp_pat
     share = torch.linspace(0, 1, 150)[:, None]
     shared = (1 - share) * pieces[0][600:] + share * pieces[1][:150]
     expected = torch.cat([pieces[0][:600], shared, pieces[1][150:]])
-    values = imported(path).animate(speech, identity="common").vertices[..., 0]
+    model = imported(path)
+    assert model.graphs().longest == 750, "a graph has no windows"
+    values = model.animate(speech, identity="common").vertices[..., 0]
     torch.testing.assert_close(values, expected, rtol=0, atol=1e-5)
 
 

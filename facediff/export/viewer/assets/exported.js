@@ -5,7 +5,7 @@ const MODEL_FORMAT = "facediff model", MODEL_VERSION = 1;
 const NEEDED = { sampled: ["speech", "step", "motion"], direct: ["speech", "motion"] };
 const OPTIONAL = { sampled: ["start", "style"], direct: ["style"] };
 /** What a description says where a folder was written before there was a choice. */
-const EARLIER = { generation: "sampled", blending: "steps", clock: { rule: "rounded" }, style_source: "reference", longest: 0, drawn: 0, noise_of: "clip", quick_steps: [], quick_table: [] };
+const EARLIER = { generation: "sampled", blending: "steps", clock: { rule: "rounded" }, style_source: "reference", longest: 0, drawn: 0, noise_of: "clip", usual_expressivity: 1, quick_steps: [], quick_table: [] };
 const MOST_DESCRIPTION = 20e6, MOST_GRAPH = 2e9; // bytes
 
 /** Let messages in: what computes for long can be cancelled then. */
@@ -167,7 +167,7 @@ class ExportedModel {
   }
 
   /** What motion is conditioned on besides speech. Args: names and numbers, which may be absent. */
-  conditions({ identity, condition, style, seed = 0, expressivity = 1 }) {
+  conditions({ identity, condition, style, seed = 0, expressivity = this.about.usual_expressivity }) {
     const { about, arrays } = this;
     const chosen = identity ?? about.identities.find((name) => about.faces.includes(name)) ?? about.faces[0];
     const known = (what, name, names) => {

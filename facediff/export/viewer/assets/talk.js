@@ -112,6 +112,7 @@ class TalkingPage {
     options("identity", about.faces);
     options("style", about.styles);
     for (const id of ["style", "seed", "expressivity"]) find(id).closest("label").hidden = !this.offers(id);
+    find("expressivity").value = about.usual_expressivity;
     const { name } = this.facts.face; // of a model that was changed since, perhaps no face
     find("identity").value = about.faces.includes(name) ? name : about.faces[0];
     this.suit();
