@@ -23,7 +23,7 @@ from facediff.pipelines.animate import check_options
 from facediff.pipelines.trained import open_pipeline
 from facediff.speech.audio import read_recording
 from facediff.utils import SAMPLE_RATE
-from facediff.utils.batch import FileTask, Recipe, run_batch
+from facediff.utils.batch import RECORDS, FileTask, Recipe, run_batch
 from facediff.utils.files import check_folder_writable, check_writable, locked, remove_partial
 from facediff.utils.hub import is_exported, may_have_weights, model_files
 from facediff.utils.jobs import PerWorker, is_cluster
@@ -228,6 +228,9 @@ def run_folder(
     states: dict[Path, tuple[str, str]] = {}  # by recording: "made", "up to date" or "failed", and a remark
     with locked(output / LOCK, "facediff animate"):
         tasks = [FileTask(speech, output / name, recipe) for speech, name in zip(speeches, names, strict=True)]
+        if not (output / RECORDS).exists() and (others := [task.output for task in tasks if task.output.exists()]):
+            raise FaceDiffError(f"{others[0]}: would be replaced, and no batch has written it; choose a new folder")
+        (output / RECORDS).mkdir(exist_ok=True)
         for task in tasks:
             if state := _earlier_state(task, retry_failed):
                 states[task.source] = state

@@ -159,6 +159,13 @@ def test_two_batches_do_not_share_a_folder(folder: Path) -> None:
     assert run(folder) == 0
 
 
+def test_a_file_that_no_batch_wrote_stays(folder: Path) -> None:
+    (folder.parent / "out").mkdir()
+    (folder.parent / "out" / "b.npy").touch()
+    with pytest.raises(FaceDiffError, match=r"b\.npy: would be replaced"):
+        run(folder)
+
+
 def test_names_that_collide_keep_their_suffix(folder: Path, tmp_path: Path) -> None:
     (folder / "A.FLAC").write_text("x")
     (folder / "notes.txt").write_text("x")
