@@ -181,7 +181,7 @@ class Animation:
         return self.faces
 
     def part(self, frames: slice | list[int]) -> Self:
-        """The same with some of the frames only."""
+        """The same with some of the frames only; the speech stays whole."""
         part = replace(self, vertices=self.vertices[frames], head=None if self.head is None else self.head[frames])
         return part if self.values is None else part.made_of(self.space, self.values[frames], self.deltas)
 

@@ -91,6 +91,8 @@ def read_animation(
         animation = read_archive(path)
         facts = complete(complete(overrides, facts_of(animation)), defaults)
         with located(path):
+            if "template" in overrides:
+                _refuse_other_face(animation.still().vertices, facts)
             return replace(animation, **facts)
     check_known(path, "format of a motion", [path.suffix], (".npz", ".npy"))
     with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused before it is used
@@ -101,16 +103,21 @@ def read_animation(
         raise OptionError.naming(f"{path}: an array has no frame rate; give {{frame_rate}} or {{checkpoint}}")
     if "template" not in facts:
         facts = {**facts, "template": np.array(vertices[0], np.float32)}
-    elif vertices.shape[1:] == facts["template"].shape and np.isfinite(vertices[0]).all():
-        laid = robust_align(vertices[0], facts["template"], scale=True)
-        apart = np.median(np.linalg.norm(laid.apply(vertices[0]) - facts["template"], axis=-1))
-        if not (0.5 < laid.scale < 2 and apart < 0.3 * face_size(facts["template"])):
+    with located(path):
+        _refuse_other_face(vertices, facts)
+        return Animation(name=path.stem, vertices=vertices, **facts)
+
+
+def _refuse_other_face(vertices: npt.NDArray[np.floating], facts: AnimationFacts) -> None:
+    first, template = vertices[0], facts["template"]
+    if first.shape == template.shape and np.isfinite(first).all():
+        laid = robust_align(first, template, scale=True)
+        apart = np.median(np.linalg.norm(laid.apply(first) - template, axis=-1))
+        if not (0.5 < laid.scale < 2 and apart < 0.3 * face_size(template)):
             raise FaceDiffError(
-                f"{path}: its first frame does not lie on the neutral face, which is {laid.scale:.3g} times as large; "
+                f"its first frame does not lie on the neutral face, which is {laid.scale:.3g} times as large; "
                 "expected absolute vertices in the order and unit of the mesh"
             )
-    with located(path):
-        return Animation(name=path.stem, vertices=vertices, **facts)
 
 
 def facts_of(animation: Animation) -> AnimationFacts:

@@ -26,6 +26,7 @@ from facediff.data.recordings import RecordingFolder
 from facediff.data.storage import MOTION_FOLDERS as MOTION_FOLDERS
 from facediff.data.storage import ChannelFolder, ClipFolder, ClipMotion, ClipStorage, WeightFile
 from facediff.errors import FaceDiffError, damaged
+from facediff.mesh.alignment import face_size
 from facediff.mesh.flame import read_masks
 from facediff.mesh.mesh import Mesh
 from facediff.mesh.mesh_files import read_mesh
@@ -207,6 +208,9 @@ class Corpus:
             faces = read_templates(root / "templates.pkl", self.n_vertices)
             if name := next(iter(faces.keys() & templates.keys()), None):
                 raise FaceDiffError(f"{root}: {self.root} has a {name} already; import the speaker under a new name")
+            person, other = (face_size(next(iter(group.values())).numpy()) for group in (faces, templates))
+            if not 0.5 < person / other < 2:
+                raise FaceDiffError(f"{root}: {person / other:.3g} times as large as {self.root}'s faces; import again")
             templates |= faces
         return templates
 

@@ -307,7 +307,8 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def words_of(self, clip: Clip) -> str:
         """The text of a clip; clips with equal text have the same words and can be aligned in time."""
-        return clip.words
+        # Sentences of a person's recordings are numbers only.
+        return clip.name if clip.root in self.people and not clip.attributes.get("text") else clip.words
 
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]] | None:
         """A function that returns further speech (S,) at 16 kHz by number, without motion; None if there is no more.
@@ -674,7 +675,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         if trainer is None:
             return 0, 0
         epochs: Any = trainer.fit_loop.epoch_progress.current
-        batches = trainer.fit_loop.epoch_loop.batch_progress.current
+        batches: Any = trainer.fit_loop.epoch_loop.batch_progress.current
         if epochs.started <= epochs.processed:  # between two epochs
             return epochs.processed, 0
         # Not `completed`, which a checkpoint at the end of a batch is written before.

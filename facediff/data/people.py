@@ -110,6 +110,10 @@ class People(SpeechMotionDataModule):
                 splits[name] = split if len(names) > 1 else None
         return splits
 
+    def words_of(self, clip: Clip) -> str:
+        """Sentences are numbers only, unless ``clips.csv`` has a column ``text``."""
+        return clip.words if clip.attributes.get("text") else clip.name
+
     def split_of(self, clip: Clip) -> str | None:
         """By ``clips.csv``, and by who is trained on."""
         return self._splits.get(clip.name)

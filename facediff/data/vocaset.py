@@ -89,4 +89,4 @@ class Vocaset(SpeechMotionDataModule):
         The published split evaluates "the 20 unique sentences that are not shared with any other subject" (Cudeiro et
         al. 2019, section 5). A column ``text`` in ``clips.csv`` decides for all sentences.
         """
-        return clip.name if clip.number in EVALUATED and not clip.attributes.get("text") else clip.words
+        return clip.name if clip.number in EVALUATED and not clip.attributes.get("text") else super().words_of(clip)

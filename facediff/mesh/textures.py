@@ -110,8 +110,8 @@ def mesh_files(path: Path) -> list[Path]:
         if file.suffix.lower() in (".obj", ".mtl"):
             for line in file.read_bytes().decode("utf-8-sig", errors="replace").splitlines():
                 word, _, rest = line.strip().replace("\t", " ").partition(" ")
-                if word in ("mtllib", "map_Kd") and (beside := _beside(path, _file_name(rest))) not in (None, *found):
-                    found.append(beside)
+                beside = _beside(path, _file_name(rest)) if word in ("mtllib", "map_Kd") else None
+                found += [beside] if beside is not None and beside not in found else []
     return found
 
 

@@ -110,3 +110,8 @@ def test_an_imported_person_is_trained_on_beside_the_corpus(tmp_path: Path) -> N
     assert sample.reference_name in ("Ada_s01", "Ada_s02")
     assert data.assets().identities[0] == "Ada"
     assert set(data.assets().templates) == {"F2", "Ada"}
+    assert data.words_of(data.corpus.clips["Ada_s01"]) == "Ada_s01", "nobody else says the same"
+    large = 1000 * data.corpus.templates["Ada"].numpy()
+    (person / "templates.pkl").write_bytes(pickle.dumps({"Ada": large}))
+    with pytest.raises(FaceDiffError, match="times as large as"):
+        MiniBiwi(root=str(root), people=[str(person)]).assets()

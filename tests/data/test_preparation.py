@@ -92,6 +92,7 @@ def test_a_second_run_changes_nothing(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*") if path != out} == {
         path: stamp for path, stamp in before.items() if path != out
     }
+    assert prepare(toy_plan(notes=["A_e01: frames are missing"]), out, workers=1).written == 1, "of other raw files"
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_a_file_has_the_performance_its_frames_and_the_end(opened: Opened, tmp_p
     assert 0.1 <= frames[2]["lag"] < PATIENCE
     np.testing.assert_allclose([frames[2]["weights"][name] for name in ARKIT], weights_of(4), atol=1e-6)
     assert all(weight == round(weight, 6) for each in frames for weight in each["weights"].values())
-    assert end == {"type": "end", "frames": 3, "dropped": 0}
+    assert end == {"type": "end", "frames": 3, "dropped": 2}
 
 
 def test_vertices_are_offsets_from_the_neutral_face(opened: Opened, tmp_path: Path) -> None:

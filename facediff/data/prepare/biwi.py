@@ -188,7 +188,8 @@ def _find_sounds(raw: Path) -> dict[str, Path]:
         for path in (folder / file for file in files if not file.startswith(".")):
             match = SOUND_NAME.fullmatch(path.stem) or SOUND_NAME.fullmatch(f"{folder.name}_{path.stem}")
             if match and path.suffix.lower() in SOUND_SUFFIXES:
-                rank = (SOUND_SUFFIXES.index(path.suffix.lower()), 0 if match[3] else 1, str(path))
+                elsewhere = f"{'audio' not in path.parts:d}{path}"
+                rank = (SOUND_SUFFIXES.index(path.suffix.lower()), 0 if match[3] else 1, elsewhere)
                 name = f"{match[1]}_{match[2]}"
                 ranked[name] = min(ranked.get(name, (rank, path)), (rank, path))
     return {name: path for name, (_, path) in ranked.items()}

@@ -43,7 +43,7 @@ from facediff.utils.arrays import open_array
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
 from facediff.utils.files import atomic, locked
-from facediff.utils.licences import KNOWN, Licence
+from facediff.utils.licences import KNOWN, Licence, commercial_use
 from facediff.utils.plain_files import write_json, write_rows
 
 Array = npt.NDArray[np.float64]
@@ -384,6 +384,11 @@ class PeopleWriter:
         write_rows(self.out / "clips.csv", [self.rows[name] for name in sorted(self.rows)], line_end="\n")
         terms, frame_rate = self.options.licence, self.options.frame_rate
         commercial = "allowed" if self.options.commercial else KNOWN.get(terms.casefold(), "unknown")
+        # People who were tracked before may have given other terms.
+        labels = [Licence("", terms, commercial)]
+        if before := (read_manifest(self.out) or {}).get("licence"):
+            labels = list(dict.fromkeys([Licence("", before["name"], before["commercial"]), *labels]))
+        terms = "; ".join(dict.fromkeys("; ".join(label.name for label in labels).split("; ")))
         manifest = {
             "facediff": version(),
             "format": FORMAT,
@@ -393,7 +398,7 @@ class PeopleWriter:
             "unit": "m",
             "options": dict(recipe),
             "model": {"sha256": self.model.digest, "licence": LICENCE},
-            "licence": Licence(f"corpus {CORPUS}", terms, commercial).state(),
+            "licence": Licence(f"corpus {CORPUS}", terms, commercial_use(labels)).state(),
             "people": dict(people),
         }
         names = [path.relative_to(self.out).as_posix() for path in self.out.rglob("[!.]*") if path.is_file()]

@@ -8,7 +8,7 @@ authors' checkpoint. docs/methods.md lists the options for choices of the publis
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -17,22 +17,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from facediff import registry
-from facediff.data import Batch
 from facediff.models.audio_encoders import AudioEncoderFactory
-from facediff.models.inference import with_speech
 from facediff.models.layers import Heads, Share, Width, check_heads, exporting, frame_mask
 from facediff.models.published.base import DirectModel, SpeakerTable
 from facediff.models.published.convolutions import ConvolutionStack
 from facediff.models.speech_networks import Wav2Vec2Encoder
 from facediff.spaces import Space
-from facediff.utils import SAMPLE_RATE
 from facediff.utils.ranges import Range
 
 if TYPE_CHECKING:
     from facediff.models.published.cards import AuthorFiles, Facts
-
-CONTEXT_FRAMES = 64
-"""Frames that the published stream computes for each chunk of speech, the chunk's own among them."""
 
 
 @registry.model.register("LamAudio2Expression")
@@ -103,32 +97,6 @@ class LamAudio2Expression(DirectModel):
         mask = None if frames is None or exporting() else frame_mask(frames, features.shape[1])
         values: Tensor = self.network(features, weights, mask)
         return values * self.scale
-
-    def stream_chunks(self, clip: Batch, samples: int, *, context: bool) -> Iterator[Tensor]:
-        """The published stream's output for each chunk of one clip's speech, (frames, coordinates).
-
-        Args:
-            clip: a batch of one clip.
-            samples: of a chunk; 16 000 in the published stream.
-            context: compute each chunk after the speech before it; else after silence. The published code never notes
-                that the first chunk is over, so that each has silence before it.
-        """
-        speech = clip.audio[0, : int(clip.audio_lengths[0])]
-        window = SAMPLE_RATE * CONTEXT_FRAMES // 30
-        for start in range(0, len(speech), samples):
-            chunk = speech[start : start + samples]
-            # The network always hears a window of one length, as its caller's buffer is: the chunk at its end, and
-            # silence or the speech before it in front. Only the frames of the chunk are kept.
-            before = speech.new_zeros(window - len(chunk))
-            past = speech[max(0, start - len(before)) : start] if context else speech[:0]
-            before[len(before) - len(past) :] = past
-            sound = torch.cat([before, chunk])
-            count = self.frames_of(len(sound))
-            # Rounded down as the published code does: a chunk of no whole number of frames gives one frame more.
-            first = int(count - len(chunk) / SAMPLE_RATE * self.frame_rate)
-            window_clip = with_speech(clip, sound, count)
-            motion = self.generate_frames(window_clip, window_clip.frame_lengths, seeds=[0])[0]
-            yield motion.flatten(1)[first:].detach()
 
 
 class LamNetwork(nn.Module):

@@ -217,7 +217,11 @@ def test_people_are_added_and_a_bad_video_stops_no_other(tmp_path: Path, capsys:
     assert "not used" in capsys.readouterr().out
     first = (out / "vertices_npy" / "ada_s001.npy").stat().st_mtime_ns
     write_people(tmp_path / "more", {"cleo": [talking(3)]})
-    assert track(tmp_path / "more", out) == 0
+    assert track(tmp_path / "more", out, "--licence", "CC0-1.0") == 0
+    (terms,) = People(root=str(out)).licences()
+    assert (terms.name, terms.commercial) == ("unknown; CC0-1.0", "unknown"), "the others' too"
+    data = People(root=str(out), test_people=0.0)
+    assert {data.words_of(clip) for clip in data.corpus.clips.values()} == set(data.corpus.clips), "all say other words"
     assert {row["subject"] for row in read_clip_table(out).values()} == {"ada", "ben", "cleo"}
     assert (out / "vertices_npy" / "ada_s001.npy").stat().st_mtime_ns == first
     assert sorted(read_templates(out / "templates.pkl")) == ["ada", "ben", "cleo"]

@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facediff.models import LamAudio2Expression, import_checkpoint
-from facediff.models.published.lam import CONTEXT_FRAMES
 from facediff.spaces.layouts import layout
 from tests.models.published.conftest import MEL, TEXT
 
@@ -101,24 +100,6 @@ def test_parity(layers: int, prefix: str, tmp_path: Path) -> None:
         values = model.animate(speech, identity=name).vertices[..., 0]
         assert values.shape == (25, 52)  # 24.88 frames
         torch.testing.assert_close(values, reference(speech, person), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("context", [True, False])
-def test_the_published_stream(context: bool, tmp_path: Path) -> None:
-    """Every chunk is the end of 64 frames: after the speech before it, or after silence as published."""
-    reference, path = author(tmp_path, 0)
-    model, speech, window = imported(path), speech_of(40_000), 16_000 * CONTEXT_FRAMES // 30
-    expected = []
-    for start in range(0, 40_000, 16_000):
-        chunk = speech[start : start + 16_000]
-        past = speech[:start] if context else speech[:0]
-        heard = torch.cat([torch.zeros(window), past, chunk])[-window:]
-        expected.append(reference(heard, 1)[int(64 - len(chunk) / 16_000 * 30) :])
-    parts = list(model.stream_chunks(model.clip_of(speech, "1", None), 16_000, context=context))
-    torch.testing.assert_close(torch.cat(parts), torch.cat(expected), rtol=0, atol=1e-5)
-    model.frame_rate = 25.0  # chunks fill the speech at other rates too
-    parts = list(model.stream_chunks(model.clip_of(speech, "1", None), 16_000, context=context))
-    assert [len(part) for part in parts] == [25, 25, 13]
 
 
 def test_channels_of_a_range_are_bounded_and_rotations_are_not() -> None:
