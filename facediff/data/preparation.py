@@ -125,8 +125,8 @@ def prepare(
         recorded = {} if manifest is None else manifest.get("files", {})
         complete = {job.name: frames for job in plan.jobs if (frames := finished_frames(plan, job, out, recorded))}
         notes = plan.notes if manifest is None else manifest.get("notes", plan.notes)
-        changed = {note.partition(":")[0] for note in {*notes} ^ {*plan.notes}}  # clips of other raw files than before
-        complete = {name: frames for name, frames in complete.items() if name not in changed}
+        repaired = {note.partition(":")[0] for note in {*notes} ^ {*plan.notes}}  # clips of other raw files than before
+        complete = {name: frames for name, frames in complete.items() if name not in repaired}
         if manifest is not None and not (out / STATE).exists() and _is_complete(plan, complete, out, manifest):
             return _report(plan, out, manifest, 0)
         _refuse_strays(plan, out)

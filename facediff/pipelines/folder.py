@@ -228,8 +228,8 @@ def run_folder(
     states: dict[Path, tuple[str, str]] = {}  # by recording: "made", "up to date" or "failed", and a remark
     with locked(output / LOCK, "facediff animate"):
         tasks = [FileTask(speech, output / name, recipe) for speech, name in zip(speeches, names, strict=True)]
-        if not (output / RECORDS).exists() and (others := [task.output for task in tasks if task.output.exists()]):
-            raise FaceDiffError(f"{others[0]}: would be replaced, and no batch has written it; choose a new folder")
+        if not (output / RECORDS).exists() and (strangers := [task.output for task in tasks if task.output.exists()]):
+            raise FaceDiffError(f"{strangers[0]}: would be replaced, and no batch has written it; choose a new folder")
         (output / RECORDS).mkdir(exist_ok=True)
         for task in tasks:
             if state := _earlier_state(task, retry_failed):

@@ -73,13 +73,13 @@ class JsonLines(Receiver):
             about["neutral"] = _rounded(performance.neutral)
             about["faces"] = performance.faces.tolist()
         self._put(about)
-        self._before = 0  # dropped before they came here
+        self._earlier_drops = 0  # dropped before they came here
         self._outbox = Outbox(self._write, WAITING, f"frames of {self.name}")
 
     def send(self, frame: LiveFrame) -> None:
         """Hand a frame over to the thread that writes."""
         if self._outbox is not None:
-            self._before = frame.dropped
+            self._earlier_drops = frame.dropped
             self._outbox.put(frame)
 
     def _write(self, frame: LiveFrame) -> None:
@@ -127,8 +127,8 @@ class JsonLines(Receiver):
         with suppress(OSError), self._open:
             if outbox.failure is not None:
                 raise outbox.failure  # leaves no half-written file behind
-            written = outbox.given - self._dropped
-            self._put({"type": "end", "frames": written, "dropped": self._dropped + self._before})
+            lines = outbox.given - self._dropped
+            self._put({"type": "end", "frames": lines, "dropped": self._dropped + self._earlier_drops})
         self._outbox = None
 
     def status(self) -> str:
