@@ -16,12 +16,10 @@ from tests.fakes import style_content
 from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import Tiny
 
-Weights = dict[str, list[Any]]
-
 
 @pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`")
 def test_runs_after_others(make_model: Callable[..., DualPathDiffusion], tiny_root: Path, tmp_path: Path) -> None:
-    def weights_of(folder: str, data: Tiny, callbacks: list[Any], path: Path | None = None) -> Weights:
+    def weights_of(folder: str, data: Tiny, callbacks: list[Any], path: Path | None = None) -> dict[str, Any]:
         pl.seed_everything(0)
         (tmp_path / folder).mkdir(exist_ok=True)
         model, trainer = make_model(), quiet_trainer(tmp_path / folder, callbacks=callbacks, enable_checkpointing=True)

@@ -88,7 +88,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, st
     """Exit status and error of every command line, in one process that has the base install's packages only."""
     folder = tmp_path_factory.mktemp("base")
     soundfile.write(folder / "a.wav", np.zeros(16_000), 16_000)
-    np.save(folder / "a.npy", np.zeros((10, 4, 3), np.float32))
+    np.save(folder / "a.npy", np.stack([np.eye(4, 3, -1, dtype=np.float32)] * 10))
     (folder / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 3 4\n")
     for name in ("c.ckpt", "plan", "a.mp4"):
         (folder / name).write_text("x")

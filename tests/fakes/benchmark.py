@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
 from facediff.benchmark import ReportOutline, Result
+from facediff.benchmark.outline import write_outline
 
 COLUMNS: dict[str, dict[str, str | None]] = {
     "lve": {"pooling": "frames", "better": "lower"},
@@ -109,3 +112,15 @@ def outline(
         published=(),
         cells=tuple(f"method_{place}-{corpus}-seed{run}" for place in range(rows) for run in range(seeds)),
     )
+
+
+def write_benchmark(folder: Path) -> None:
+    """Write ``plan.yaml``, which scores the predictions in ``ours`` on ``corpus``, and a finished ``benchmark/``."""
+    (folder / "tiny.yaml").write_text("class_path: tests.fakes.tiny.Tiny\ninit_args: {}\n")
+    (folder / "plan.yaml").write_text(
+        "corpora: {tiny: {data: tiny.yaml, root: corpus}}\nmethods: {ours: {predictions: ours}}\n"
+    )
+    made = results(rows=2, seeds=2, clips=4)
+    write_outline(folder / "benchmark", dataclasses.replace(outline(rows=2, seeds=2), name="benchmark"))
+    for result in made:
+        result.write(folder / "benchmark")

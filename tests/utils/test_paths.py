@@ -17,7 +17,7 @@ from facediff.cli.app import main
 from facediff.cli.configs import with_files
 from facediff.data.corpus import load_template_dict
 from facediff.evaluation.file_pairs import TRUTH_PATTERN, NamePattern, index_truths, list_names, pair_up
-from facediff.utils.files import atomic, atomic_folder, cache_dir, check_writable
+from facediff.utils.files import atomic, atomic_folder, check_writable
 from facediff.utils.paths import from_home
 from tests.fakes.tiny import Tiny
 
@@ -73,11 +73,6 @@ def test_python_reads_and_writes_in_the_home(speech: Path, home: Path) -> None:
     assert animation.save(Path("~/o.csv"))[0] == home / "o.csv"
     assert facediff.read("~/o.csv").frame_rate == animation.frame_rate
     assert not list(Path.cwd().iterdir())
-
-
-def test_the_cache_is_in_the_home(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FACEDIFF_CACHE", "~/cache")
-    assert cache_dir() == home / "cache"
 
 
 def test_nothing_writes_a_folder_of_that_name(home: Path) -> None:

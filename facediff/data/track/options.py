@@ -33,7 +33,7 @@ class TrackingOptions:
         smoothing: of the motion, by region; or none
         scale: size of the faces: as the model's canonical face, or so that irises measure 11.7 mm
         clip_seconds: approximate length of a clip
-        licence: terms of the footage, such as CC-BY-4.0 or "consent of Maria"
+        licence: terms of the footage, such as CC-BY-4.0 or "consent of Maria"; those of earlier runs stay beside them
         commercial: the terms allow commercial use
     """
 
