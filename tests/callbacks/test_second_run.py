@@ -21,7 +21,6 @@ from tests.fakes.tiny import Tiny
 def test_runs_after_others(make_model: Callable[..., DualPathDiffusion], tiny_root: Path, tmp_path: Path) -> None:
     def weights_of(folder: str, data: Tiny, callbacks: list[Any], path: Path | None = None) -> dict[str, Any]:
         pl.seed_everything(0)
-        (tmp_path / folder).mkdir(exist_ok=True)
         model, trainer = make_model(), quiet_trainer(tmp_path / folder, callbacks=callbacks, enable_checkpointing=True)
         trainer.fit(model, datamodule=data, ckpt_path=path)
         if data.hparams["lips"] is not None:

