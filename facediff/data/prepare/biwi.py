@@ -180,7 +180,7 @@ def _find_sequences(raw: Path, subjects: Sequence[str], notes: list[str]) -> dic
 
 def _find_sounds(raw: Path) -> dict[str, Path]:
     """Sound of every clip. A recording cut to the motion is preferred, then any other recording, then a video."""
-    ranked: dict[str, tuple[tuple[int, int, str], Path]] = {}
+    ranked: dict[str, tuple[tuple[int, bool, bool, str], Path]] = {}
     for path_text, folders, files in os.walk(raw, followlinks=True):
         folder = Path(path_text)
         deep = len(folder.relative_to(raw).parts) >= SOUND_DEPTH
@@ -188,8 +188,7 @@ def _find_sounds(raw: Path) -> dict[str, Path]:
         for path in (folder / file for file in files if not file.startswith(".")):
             match = SOUND_NAME.fullmatch(path.stem) or SOUND_NAME.fullmatch(f"{folder.name}_{path.stem}")
             if match and path.suffix.lower() in SOUND_SUFFIXES:
-                elsewhere = f"{'audio' not in path.parts:d}{path}"
-                rank = (SOUND_SUFFIXES.index(path.suffix.lower()), 0 if match[3] else 1, elsewhere)
+                rank = (SOUND_SUFFIXES.index(path.suffix.lower()), not match[3], "audio" not in path.parts, str(path))
                 name = f"{match[1]}_{match[2]}"
                 ranked[name] = min(ranked.get(name, (rank, path)), (rank, path))
     return {name: path for name, (_, path) in ranked.items()}

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ from facediff.utils.arrays import open_array
 from facediff.utils.batch import FileTask, Recipe, begin_folder, run_batch
 from facediff.utils.checksums import describe_files
 from facediff.utils.files import atomic, locked
-from facediff.utils.licences import KNOWN, Licence, commercial_use
+from facediff.utils.licences import KNOWN, Licence, commercial_use, read_licences
 from facediff.utils.plain_files import write_json, write_rows
 
 Array = npt.NDArray[np.float64]
@@ -163,10 +164,11 @@ def track_people(
         manifest = read_manifest(out)
         begin_folder(out, STATE, recipe, "facediff data track", manifest.get("options") if manifest else None)
         tasks = tracking_tasks(videos, out / TRACKS, model, options)
-        pending = [task for person in tasks.values() for task in person if not task.output.exists() or task.change()]
-        for task in pending:
-            if task.output.exists():
-                note(f"{task.source}: replaces the clips of {task.source.name}, since {task.change()}")
+        changes = [(task, task.change()) for task in chain.from_iterable(tasks.values())]
+        pending = [task for task, change in changes if change or not task.output.exists()]
+        for task, change in changes:
+            if change and task.output.exists():
+                note(f"{task.source}: replaces the clips of {task.source.name}, since {change}")
         execution: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "writes": out}
         title = "tracking" if progress else ""
         failed: dict[str, str] = {}
@@ -388,10 +390,9 @@ class PeopleWriter:
         terms, frame_rate = self.options.licence, self.options.frame_rate
         commercial = "allowed" if self.options.commercial else KNOWN.get(terms.casefold(), "unknown")
         # People who were tracked before may have given other terms.
-        labels = [Licence("", terms, commercial)]
-        if before := (read_manifest(self.out) or {}).get("licence"):
-            labels = list(dict.fromkeys([Licence("", before["name"], before["commercial"]), *labels]))
-        terms = "; ".join(dict.fromkeys("; ".join(label.name for label in labels).split("; ")))
+        stated = read_manifest(self.out).get("licence")
+        labels = [*read_licences(self.out / MANIFEST, [stated] if stated else []), Licence("", terms, commercial)]
+        terms = "; ".join(dict.fromkeys(term for label in labels for term in label.name.split("; ")))
         manifest = {
             "facediff": version(),
             "format": FORMAT,
