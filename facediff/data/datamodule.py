@@ -307,8 +307,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
 
     def words_of(self, clip: Clip) -> str:
         """The text of a clip; clips with equal text have the same words and can be aligned in time."""
-        # Sentences of a person's recordings are numbers only.
-        return clip.name if clip.root in self.people and not clip.attributes.get("text") else clip.words
+        return clip.name if self.only_numbers(clip) and not clip.attributes.get("text") else clip.words
+
+    def only_numbers(self, clip: Clip) -> bool:
+        """Whether equal sentences of clips such as this one, by their names, are not equal words."""
+        return clip.root in self.people
 
     def further_speech(self) -> Callable[[int], npt.NDArray[np.float32]] | None:
         """A function that returns further speech (S,) at 16 kHz by number, without motion; None if there is no more.
@@ -336,6 +339,11 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
             print(f"{self.corpus_name}: missing clips, which are left out: {counts}", flush=True)
         for data in self.further.values():
             data.prepare_data()
+
+    def setup(self, stage: str) -> None:
+        """Begin a run: models that were trained before asked for other samples."""
+        for data in (self, *self.further.values()):
+            data.features.reader, data.pair_sentences, data.aligner, data.window_context = None, False, None, (0, 0)
 
     # The clips.
 

@@ -110,9 +110,9 @@ class People(SpeechMotionDataModule):
                 splits[name] = split if len(names) > 1 else None
         return splits
 
-    def words_of(self, clip: Clip) -> str:
-        """Sentences are numbers only, unless ``clips.csv`` has a column ``text``."""
-        return clip.words if clip.attributes.get("text") else clip.name
+    def only_numbers(self, clip: Clip) -> bool:
+        """Always: clips are counted by person."""
+        return True
 
     def split_of(self, clip: Clip) -> str | None:
         """By ``clips.csv``, and by who is trained on."""

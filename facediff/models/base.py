@@ -410,8 +410,6 @@ class AnimationModel(CheckpointContent, ABC):
 
     def use_corpus(self, data: SpeechMotionDataModule, stage: str) -> None:
         """Take a corpus's assets, and measure what training needs of it."""
-        # Another model may have set these before.
-        data.features.reader, data.pair_sentences, data.aligner, data.window_context = None, False, None, (0, 0)
         if stage != "predict":
             _ = self.evaluation  # an unknown protocol or metric is reported before the corpus is read
         if stage == "fit":
