@@ -100,14 +100,14 @@ def with_files(content: Any) -> Any:  # noqa: ANN401
     return from_home(content)
 
 
-def guard_configs(mode: str) -> None:
-    """Let jsonargparse check every YAML text of a parser mode before it reads it: also files that a config names."""
+def guard_configs() -> None:
+    """Let jsonargparse check every YAML text before it reads it: also files that a config names."""
     from jsonargparse import set_loader
     from jsonargparse._optionals import get_omegaconf_loader  # its public get_loader knows the mode after a parse only
 
     from facediff.models.earlier_versions import without_removed_options
 
-    read = get_omegaconf_loader(mode)  # type: ignore[no-untyped-call]
+    read = get_omegaconf_loader("omegaconf+")  # type: ignore[no-untyped-call]
 
     def load(text: str) -> Any:  # noqa: ANN401
         if "\n" in text:  # a file, and not a value
@@ -119,7 +119,7 @@ def guard_configs(mode: str) -> None:
                 raise
         return registry.with_paths(without_removed_options(with_files(read(text)), "--config"))
 
-    set_loader(mode, load, exceptions=(yaml.YAMLError,))
+    set_loader("omegaconf+", load, exceptions=(yaml.YAMLError,))
 
 
 def change_values(arguments: Sequence[str], change: Callable[[str, str], str]) -> list[str]:
@@ -138,9 +138,19 @@ def change_values(arguments: Sequence[str], change: Callable[[str, str], str]) -
 
 def value_of(arguments: Sequence[str], flag: str) -> str | None:
     """The first value of a flag; None if it is not given."""
-    values: dict[str, str] = {}
-    change_values(arguments, lambda option, value: values.setdefault(option, value))
-    return values.get(flag)
+    return next((value for option, value in values_in(arguments) if option == flag), None)
+
+
+def values_in(arguments: Sequence[str]) -> list[tuple[str, str]]:
+    """Every value with its flag, in the order of the words; the flag is empty for a word that follows none."""
+    values: list[tuple[str, str]] = []
+
+    def note(flag: str, value: str) -> str:
+        values.append((flag, value))
+        return value
+
+    change_values(arguments, note)
+    return values
 
 
 def explain(arguments: Sequence[str]) -> str:
@@ -150,17 +160,13 @@ def explain(arguments: Sequence[str]) -> str:
     does not exist, with the nearest; and an option before its config. Everything else is the parser's to say.
     """
     classes: list[tuple[str, str]] = []
-
-    def note(flag: str, value: str) -> str:
+    for flag, value in values_in(arguments):
         option = "" if flag in ("-c", "--config") else flag.lstrip("-").removesuffix("+").removesuffix(".help")
         try:
             content = yaml.load(value, yaml.BaseLoader)  # noqa: S506 - makes texts only
         except yaml.YAMLError:
             content = value
         classes.extend(classes_in(option, content, Path.cwd()))
-        return value
-
-    change_values(arguments, note)
     faults = filter(None, (fault_of(option, name) for option, name in dict.fromkeys(classes)))
     return next(faults, "") or next((f"{flag} {EARLY}" for flag, _ in early_options(arguments)), "")
 
@@ -171,17 +177,11 @@ EARLY = "stands before --config; give options after --config, which they change"
 def early_options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Options of a part of a config that stand before a config, ``--model.dim``, each with the config's file."""
     earlier: list[str] = []
-    found: list[tuple[str, str]] = []
-
-    def look(flag: str, value: str) -> str:
+    for flag, value in values_in(arguments):
         if flag in ("-c", "--config"):
-            found.extend((option, value) for option in earlier)
+            yield from ((option, value) for option in earlier)
         elif flag.startswith("--") and "." in flag:
             earlier.append(flag)
-        return value
-
-    change_values(arguments, look)
-    yield from found
 
 
 def refuse_early(arguments: Sequence[str]) -> None:

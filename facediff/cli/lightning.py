@@ -32,6 +32,7 @@ from facediff.cli.configs import (
     name_of,
     refuse_early,
     value_of,
+    values_in,
 )
 from facediff.cli.process import StoppedBySignal, tell
 from facediff.errors import FaceDiffError, import_failure
@@ -191,14 +192,10 @@ def exit_statuses() -> Iterator[None]:
 def refuse_repeated(arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice with different values: the last one would win without a word."""
     values: dict[str, str] = {}
-
-    def note(flag: str, value: str) -> str:
+    for flag, value in values_in(arguments):
         option = flag.replace(".init_args", "")
         if values.setdefault(option, value) != value and not option.startswith(REPEATABLE):
             raise FaceDiffError(f"{option} is given twice, as {values[option]} and as {value}; give it once")
-        return value
-
-    change_values(arguments, note)
 
 
 def import_corpus(
@@ -242,13 +239,9 @@ def import_classes(arguments: Sequence[str]) -> list[tuple[str, str]]:
     from facediff.utils.hints import is_path
 
     named: list[tuple[str, str]] = []
-
-    def note(flag: str, value: str) -> str:
+    for flag, value in values_in(arguments):
         option = "" if flag in ("-c", "--config") else flag.lstrip("-")
         named.extend(classes_in(option, value, Path.cwd()))
-        return value
-
-    change_values(arguments, note)
     options = {"model", *(f"model.{kind}" for kind in registry.COMPONENTS)}
     classes = [pair for pair in named if pair[0] in options and is_path(pair[1])]
     for option, name in classes:
@@ -322,15 +315,8 @@ def experiment_name(arguments: Sequence[str]) -> str | None:
 
 def config_files(arguments: Sequence[str]) -> list[str]:
     """The files of all ``--config`` options."""
-    files: list[str] = []
-
-    def note(flag: str, value: str) -> str:
-        if flag in ("-c", "--config") and os.path.isfile(value):  # noqa: PTH113 - a text may be no path at all
-            files.append(value)
-        return value
-
-    change_values(arguments, note)
-    return files
+    named = (value for flag, value in values_in(arguments) if flag in ("-c", "--config"))
+    return [value for value in named if os.path.isfile(value)]  # noqa: PTH113 - a text may be no path at all
 
 
 def fresh_component(flag: str, value: str) -> str:

@@ -75,7 +75,7 @@ def parsing(arguments: Sequence[str], experiment: str) -> Iterator[None]:
     ``experiment`` replaces ``${experiment_name:}`` in configs of 1.x.
     """
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    guard_configs("omegaconf+")
+    guard_configs()
     OmegaConf.register_resolver("experiment_name", lambda: experiment, replace=True)
     # Where a config holds ${…}, jsonargparse dumps the defaults of all options.
     register_type(torch.device, str, torch.device, fail_already_registered=False)
