@@ -200,21 +200,6 @@ def test_the_state_of_every_generator_comes_back(monkeypatch: pytest.MonkeyPatch
     restore_random_states({name: state for name, state in states.items() if name != "mps"})  # of an earlier version
 
 
-def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plugin, path = AtomicCheckpointIO(), tmp_path / "last.ckpt"
-    plugin.save_checkpoint({"a": torch.zeros(3)}, path)
-    before = path.read_bytes()
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(FaceDiffError, match=r"last\.ckpt"):
-        plugin.save_checkpoint({"a": torch.ones(3)}, path)
-    assert path.read_bytes() == before
-    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
-
-
 @pytest.mark.parametrize(
     ("fault", "reported"),
     [("[enforce fail at inline_container.cc:672] . unexpected pos 704 vs 598", FaceDiffError), ("CUDA", RuntimeError)],

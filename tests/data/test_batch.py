@@ -74,9 +74,9 @@ def test_assets_of_channels_survive_a_checkpoint_and_refuse_what_does_not_fit(tm
     again = Assets.from_state(state)
     assert again.space == CHANNELS
     motion = torch.randn(4, 6, 1)
-    assert torch.equal(again.to_vertices(motion, "A"), assets.to_vertices(motion, "A"))
+    assert torch.equal(again.to_scored(motion, "A"), assets.to_scored(motion, "A"))
     # A speaker without shapes of their own moves by the mean of all others'.
-    assert torch.equal(again.to_vertices(motion, "stranger"), assets.to_vertices(motion, "A"))
+    assert torch.equal(again.to_scored(motion, "stranger"), assets.to_scored(motion, "A"))
     rig = state["rig"]
     wrong = [
         {"space": CHANNELS.state() | {"channels": ["a"], "rotations": []}},
@@ -95,5 +95,5 @@ def test_assets_of_channels_survive_a_checkpoint_and_refuse_what_does_not_fit(tm
 def test_channels_without_a_rig_have_no_mesh(tmp_path: Path) -> None:
     assets = replace(TinyChannels(root=str(write_channels(tmp_path / "channels"))).assets(), rig=None)
     with pytest.raises(FaceDiffError, match="rig"):
-        assets.to_vertices(torch.zeros(1, 6, 1), "A")
+        _ = assets.mesh
     assert Assets.from_state(assets.state()).rig is None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,13 @@ from facediff.errors import FaceDiffError
 from facediff.export import write_animations
 from facediff.export.glb_own_shapes import drive_avatar, own_shapes
 from facediff.mesh import read_mesh
-from facediff.mesh.glb import Glb
+from facediff.mesh.glb import Glb, open_glb
 from facediff.mesh.glb_scene import placed_parts
 from facediff.spaces import layout
 from facediff.spaces.arkit import ALPHABETICAL
 from facediff.spaces.visemes import visemes
 from tests.fakes.avatar import AvatarPart, avatar_parts, write_avatar
+from tests.fakes.glb_reader import without_new_animation
 from tests.fakes.glb_targets import pack
 from tests.fakes.gltf_scene import GltfScene
 from tests.fakes.small_face import F1, small_shapes
@@ -51,10 +51,6 @@ def spoken() -> Animation:
     return plain.made_of(layout("arkit"), values)
 
 
-def opened(path: Path) -> Glb:
-    return Glb(path.read_bytes(), path)
-
-
 def tracks(glb: Glb) -> dict[tuple[str, str], np.ndarray]:
     """Values of the animation that was added by the node's name and what moves, one row a frame."""
     motion = glb.content["animations"][0]
@@ -70,7 +66,7 @@ def tracks(glb: Glb) -> dict[tuple[str, str], np.ndarray]:
 
 def posed(path: Path, frame: int) -> dict[str, np.ndarray]:
     """Vertices of each node's mesh at a frame: targets by their weights, then the skin of bones that have turned."""
-    glb = opened(path)
+    glb = open_glb(path)
     moving = tracks(glb)
     nodes = {node["name"]: node for node in glb.content["nodes"] if "mesh" not in node}
     for (name, kind), rows in moving.items():
@@ -88,19 +84,10 @@ def posed(path: Path, frame: int) -> dict[str, np.ndarray]:
     return result
 
 
-def without_new_animation(new: dict[str, Any], old: dict[str, Any]) -> dict[str, Any]:
-    made = copy.deepcopy(new)
-    for kind in ("accessors", "bufferViews"):
-        del made[kind][len(old.get(kind, [])) :]
-    del made["animations"][0]
-    made["buffers"][0]["byteLength"] = old["buffers"][0]["byteLength"]
-    return made
-
-
 def test_weights_go_by_name_and_all_else_stays(tmp_path: Path, parts: dict[str, AvatarPart], spoken: Animation) -> None:
     write_avatar(tmp_path / "avatar.glb", parts)
     (written,) = write_animations(tmp_path / "out.glb", [spoken], into=tmp_path / "avatar.glb", own_shapes=True)
-    old, new = opened(tmp_path / "avatar.glb"), opened(written)
+    old, new = open_glb(tmp_path / "avatar.glb"), open_glb(written)
     assert new.binary.startswith(old.binary)
     assert without_new_animation(new.content, old.content) == old.content
     moving = tracks(new)
@@ -138,7 +125,7 @@ def test_carried_motion_is_solved_for_on_the_avatar(tmp_path: Path, parts: dict[
     rest = mesh.vertices.astype(np.float32)
     vertices, before = np.repeat(rest[None], FRAMES, axis=0), 0
     opening = np.clip(np.sin(np.arange(FRAMES) / 5), 0, 0.8)
-    glb, names = opened(tmp_path / "avatar.glb"), list(parts["Head"].targets)
+    glb, names = open_glb(tmp_path / "avatar.glb"), list(parts["Head"].targets)
     for part in placed_parts(glb):
         targets = part.primitive.get("targets")
         for shape, weights in (("jawOpen", opening), ("eyeBlinkLeft", opening[::-1])):
@@ -149,7 +136,7 @@ def test_carried_motion_is_solved_for_on_the_avatar(tmp_path: Path, parts: dict[
         before += len(part.local)
     animation = Animation("talk", vertices, rest, 25.0, faces=mesh.faces)
     drive_avatar(tmp_path / "out.glb", tmp_path / "avatar.glb", animation)
-    rows = tracks(opened(tmp_path / "out.glb"))["Head", "weights"]
+    rows = tracks(open_glb(tmp_path / "out.glb"))["Head", "weights"]
     assert np.abs(rows[:, names.index("jawOpen")] - opening).max() < 0.03
     assert np.abs(rows[:, names.index("eyeBlinkLeft")] - opening[::-1]).max() < 0.03
     with pytest.raises(FaceDiffError, match="vertices"):
@@ -206,7 +193,7 @@ def test_visemes_are_driven_where_the_avatar_has_no_arkit_mouth(
     assert spoken.values is not None
     truth, space = visemes(spoken.values, layout("arkit"), "vrm")
     drive_avatar(tmp_path / "out.glb", tmp_path / "vrm.glb", spoken)
-    rows = tracks(opened(tmp_path / "out.glb"))["Head", "weights"]
+    rows = tracks(open_glb(tmp_path / "out.glb"))["Head", "weights"]
     names = list(parts["Head"].targets)
     for name, vowel in VISEMES.items():
         expected = truth[:, space.channels.index(vowel)]
@@ -216,7 +203,7 @@ def test_visemes_are_driven_where_the_avatar_has_no_arkit_mouth(
     assert rows.any(axis=0).sum() <= 6
     # The same expressions, bound by VRM's extensions to targets of any name.
     write_avatar(tmp_path / "plain.glb", parts, names=other)
-    glb = opened(tmp_path / "plain.glb")
+    glb = open_glb(tmp_path / "plain.glb")
     head = next(i for i, node in enumerate(glb.content["nodes"]) if node["name"] == "Head")
     mesh, at = glb.content["nodes"][head]["mesh"], names.index("jawOpen")
     zero = [
@@ -233,7 +220,7 @@ def test_visemes_are_driven_where_the_avatar_has_no_arkit_mouth(
     ):
         (tmp_path / "bound.glb").write_bytes(pack({**glb.content, "extensions": extension}, glb.binary))
         drive_avatar(tmp_path / "out.glb", tmp_path / "bound.glb", spoken)
-        bound = tracks(opened(tmp_path / "out.glb"))["Head", "weights"]
+        bound = tracks(open_glb(tmp_path / "out.glb"))["Head", "weights"]
         np.testing.assert_allclose(bound[:, at], 0.5 * truth[:, space.channels.index("A")], atol=1e-6)
 
 
@@ -251,7 +238,7 @@ def test_oculus_visemes_under_the_names_of_exporters(
     drive_avatar(tmp_path / "out.glb", tmp_path / "avatar.glb", spoken)
     assert spoken.values is not None
     truth, space = visemes(spoken.values, layout("arkit"), "oculus")
-    rows = tracks(opened(tmp_path / "out.glb"))["Head", "weights"]
+    rows = tracks(open_glb(tmp_path / "out.glb"))["Head", "weights"]
     at = list(parts["Head"].targets).index(mouth[spelled.index("O")])
     np.testing.assert_allclose(rows[:, at], truth[:, space.channels.index("oh")], atol=1e-6)
 
@@ -279,7 +266,7 @@ def test_bones_by_their_names(
     without = ("eyeLook", "jawOpen") if bone == "jaw" else ("eyeLook",)
     gone = {n: f"x{k}" for k, n in enumerate(ALPHABETICAL) if n.startswith(without)}
     write_avatar(tmp_path / "avatar.glb", parts, names=gone)
-    glb = opened(tmp_path / "avatar.glb")
+    glb = open_glb(tmp_path / "avatar.glb")
     joint = next(node for node in glb.content["nodes"] if node["name"] == "HeadJoint")
     joint["name"] = name
     # A bone whose rest is a matrix, which an animated node must not have.
@@ -290,7 +277,7 @@ def test_bones_by_their_names(
     own = own_shapes(tmp_path / "bone.glb")
     assert own.names == ({} if bone is None else {bone: name})
     drive_avatar(tmp_path / "out.glb", tmp_path / "bone.glb", spoken)
-    moving = tracks(opened(tmp_path / "out.glb"))
+    moving = tracks(open_glb(tmp_path / "out.glb"))
     if bone is None:
         assert {kind for _, kind in moving} == {"weights"}
         return
@@ -320,7 +307,7 @@ def test_bones_of_vrms_older_version_turn_about_a_face_that_looks_back(
     without = ("eyeLook", "jawOpen") if name == "JawJoint" else ("eyeLook",)
     gone = {n: f"x{k}" for k, n in enumerate(ALPHABETICAL) if n.startswith(without)}
     write_avatar(tmp_path / "avatar.glb", parts, names=gone)
-    glb = opened(tmp_path / "avatar.glb")
+    glb = open_glb(tmp_path / "avatar.glb")
     next(node for node in glb.content["nodes"] if node["name"] == "HeadJoint")["name"] = name
     before = posed_at_rest(tmp_path / "avatar.glb")["Hair"] - NECK
     after = {}
@@ -336,5 +323,5 @@ def test_bones_of_vrms_older_version_turn_about_a_face_that_looks_back(
 
 
 def posed_at_rest(path: Path) -> dict[str, np.ndarray]:
-    glb = opened(path)
+    glb = open_glb(path)
     return {glb.content["nodes"][part.node]["name"]: part.points for part in placed_parts(glb)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -55,3 +56,13 @@ class Reader:
             index = target[attribute] if isinstance(target, dict) else getattr(target, attribute)
             made = made + weight * self.values(index)
         return made
+
+
+def without_new_animation(new: dict[str, Any], old: dict[str, Any]) -> dict[str, Any]:
+    """The new description of a .glb file less the first animation, and the data added to the old one."""
+    made = copy.deepcopy(new)
+    for kind in ("accessors", "bufferViews"):
+        del made[kind][len(old.get(kind, [])) :]
+    del made["animations"][0]
+    made["buffers"][0]["byteLength"] = old["buffers"][0]["byteLength"]
+    return made

@@ -164,15 +164,7 @@ def resampled(features: Tensor, dataset: str, frames: int | None = None) -> tupl
 def decoder_state(prefix: str, dim: int, layers: int, draw: Drawn, hidden: int | None = None) -> State:
     made: State = {}
     for j in range(layers):
-        name = f"{prefix}layers.{j}"
-        for part in ("self_attn", "multihead_attn"):
-            made |= {f"{name}.{part}.in_proj_weight": draw(3 * dim, dim)}
-            made |= {f"{name}.{part}.in_proj_bias": draw(3 * dim, spread=0.1)}
-            made |= linear_state(f"{name}.{part}.out_proj", dim, dim, draw)
-        made |= linear_state(f"{name}.linear1", hidden or 2 * dim, dim, draw)
-        made |= linear_state(f"{name}.linear2", dim, hidden or 2 * dim, draw)
-        for norm in ("norm1", "norm2", "norm3"):
-            made |= norm_state(f"{name}.{norm}", dim, draw)
+        made |= unmasked_layer_state(f"{prefix}layers.{j}", dim, hidden or 2 * dim, draw, cross=True)
     return made
 
 
@@ -417,22 +409,26 @@ def selftalk_state(dataset: str, seed: int = 0, dim: int = 16, reader_layers: in
     return made | linear_state("lm_head", LETTERS, HIDDEN, draw)
 
 
-def unmasked_layer(x: Tensor, memory: Tensor | None, s: State, name: str, heads: int) -> Tensor:
-    """Post-norm, ReLU; with a memory, of the decoder's form."""
+def unmasked_layer(
+    x: Tensor,
+    memory: Tensor | None,
+    s: State,
+    name: str,
+    heads: int,
+    mask: Tensor | float = 0.0,
+    activation: Callable[[Tensor], Tensor] = torch.relu,
+) -> Tensor:
+    """torch's post-norm layer; with a memory, of the decoder's form, ``mask`` added to its scores."""
 
-    def heard(x: Tensor, context: Tensor, part: str) -> Tensor:
-        thirds = zip(
-            (x, context, context),
-            s[f"{name}.{part}.in_proj_weight"].chunk(3),
-            s[f"{name}.{part}.in_proj_bias"].chunk(3),
-            strict=True,
-        )
-        return linear(attend(*(F.linear(*each) for each in thirds), heads), s, f"{name}.{part}.out_proj")
+    def mixed(x: Tensor, context: Tensor, part: str, bias: Tensor | float) -> Tensor:
+        weights, biases = s[f"{name}.{part}.in_proj_weight"].chunk(3), s[f"{name}.{part}.in_proj_bias"].chunk(3)
+        q, k, v = (F.linear(y, w, b) for y, w, b in zip((x, context, context), weights, biases, strict=True))
+        return linear(attend(q, k, v, heads, bias), s, f"{name}.{part}.out_proj")
 
-    x = layer_norm(x + heard(x, x, "self_attn"), s, f"{name}.norm1")
+    x = layer_norm(x + mixed(x, x, "self_attn", 0.0), s, f"{name}.norm1")
     if memory is not None:
-        x = layer_norm(x + heard(x, memory, "multihead_attn"), s, f"{name}.norm2")
-    fed = linear(torch.relu(linear(x, s, f"{name}.linear1")), s, f"{name}.linear2")
+        x = layer_norm(x + mixed(x, memory, "multihead_attn", mask), s, f"{name}.norm2")
+    fed = linear(activation(linear(x, s, f"{name}.linear1")), s, f"{name}.linear2")
     return layer_norm(x + fed, s, f"{name}.norm{2 if memory is None else 3}")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path, PosixPath
 from typing import Any
 
@@ -27,6 +28,7 @@ from tests.fakes.published import (
     layer_norm,
     linear,
     linear_state,
+    unmasked_layer,
     unmasked_layer_state,
 )
 
@@ -34,19 +36,7 @@ WINDOW, CONTEXT, STEPS, SHAPE, STYLE, DIM = 20, 4, 5, 100, 16, 16
 SCALES, CODE, CODEC, CHANNELS = (1, 2, 5, 10), 8, 16, 106
 
 
-def gelu_layer(x: Tensor, memory: Tensor | None, s: State, name: str, heads: int, mask: Tensor | float = 0.0) -> Tensor:
-    """torch's post-norm layer with GELU; with a memory, of the decoder's form, ``mask`` added to its scores."""
-
-    def mixed(x: Tensor, context: Tensor, part: str, bias: Tensor | float) -> Tensor:
-        weights, biases = s[f"{name}.{part}.in_proj_weight"].chunk(3), s[f"{name}.{part}.in_proj_bias"].chunk(3)
-        q, k, v = (F.linear(y, w, b) for y, w, b in zip((x, context, context), weights, biases, strict=True))
-        return linear(attend(q, k, v, heads, bias), s, f"{name}.{part}.out_proj")
-
-    x = layer_norm(x + mixed(x, x, "self_attn", 0.0), s, f"{name}.norm1")
-    if memory is not None:
-        x = layer_norm(x + mixed(x, memory, "multihead_attn", mask), s, f"{name}.norm2")
-    fed = linear(F.gelu(linear(x, s, f"{name}.linear1")), s, f"{name}.linear2")
-    return layer_norm(x + fed, s, f"{name}.norm{2 if memory is None else 3}")
+gelu_layer = partial(unmasked_layer, activation=F.gelu)
 
 
 def waves(rows: int, dim: int) -> Tensor:

@@ -46,14 +46,14 @@ def place(_: int) -> tuple[int, str, str | None, str | None]:
     return os.getpid(), os.getcwd(), os.environ.get("OMP_NUM_THREADS"), os.environ.get("FACEDIFF_TRIAL")
 
 
-def counting() -> Callable[[int], tuple[int, int]]:
+def counting(base: int = 0) -> Callable[[int], tuple[int, int]]:
     """A set-up whose tasks count how often it has been used."""
     calls: list[int] = []
 
     def work(task: int) -> tuple[int, int]:
         calls.append(task)
         time.sleep(0.02)
-        return os.getpid(), len(calls)
+        return os.getpid(), base + len(calls)
 
     return work
 

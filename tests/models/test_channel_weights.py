@@ -35,7 +35,7 @@ def test_the_rig_makes_the_vertices_of_the_channels(channels: TinyChannels) -> N
     motion = channels.corpus.read_motion(clip)
     assert motion.shape[1:] == (6, 1)
     torch.testing.assert_close(
-        assets.to_vertices(motion, clip.identity), channels.mesh_corpus.read_motion(clip), atol=1e-6, rtol=0
+        assets.to_scored(motion, clip.identity), channels.mesh_corpus.read_motion(clip), atol=1e-6, rtol=0
     )
     assert (assets.n_vertices, assets.mesh.n_vertices) == (6, VERTICES)
     assert assets.regions["lips"].tolist() == [0, 2]
@@ -55,7 +55,7 @@ def test_weighed_channels_are_the_vertex_loss_without_vertices(channels: TinyCha
     errors = torch.randn(50, 6, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     errors[:, 3:] = 0  # the rig of a face does not know how the head turns
     of_channels = (errors[..., 0] @ weights.T).square().sum(1)
-    of_vertices = (assets.to_vertices(errors, "A") * points).square().flatten(1).sum(1)
+    of_vertices = (assets.to_scored(errors, "A") * points).square().flatten(1).sum(1)
     ratio = of_channels / of_vertices
     torch.testing.assert_close(ratio / ratio.mean(), torch.ones(50, dtype=torch.float64), atol=1e-6, rtol=0)
 
@@ -93,7 +93,7 @@ def test_the_dual_path_trains_tests_and_loads_in_channels(
     (scores, *_) = trainer.test(model, channels, verbose=False)
     assert {"test_a/lve", "test_a/param_lve", "test_a/param_mve", "test_a/param_fdd"} <= scores.keys()
     # What is scored as vertices is what the rig makes of the channels.
-    still = channels.assets().to_vertices(torch.zeros(1, 6, 1), "A")
+    still = channels.assets().to_scored(torch.zeros(1, 6, 1), "A")
     assert scores["test_a/still/mve"] > 0
     assert not still.any()
     trainer.save_checkpoint(tmp_path / "model.ckpt")

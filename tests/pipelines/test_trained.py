@@ -54,8 +54,7 @@ def test_the_animation_is_what_the_rig_makes_of_its_channels(checkpoint: Path) -
     assert animation.values is not None
     assert animation.values.shape == (25, 6)
     decoded = (
-        assets.to_vertices(torch.from_numpy(animation.values)[..., None], "A").numpy()
-        + assets.mesh.template("A").numpy()
+        assets.to_scored(torch.from_numpy(animation.values)[..., None], "A").numpy() + assets.mesh.template("A").numpy()
     )
     np.testing.assert_allclose(animation.still().vertices, decoded, atol=1e-6)
     assert animation.head is not None

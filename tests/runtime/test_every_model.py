@@ -181,7 +181,7 @@ def test_channels_are_decoded_by_the_rig_of_the_face(tiny_root: Path, sources: S
         assert animation.values is not None
         assert animation.space == CHANNELS
         offsets = torch.from_numpy(animation.values)[..., None] - assets.template(identity)
-        decoded = (assets.to_vertices(offsets, identity) + assets.mesh.template(identity)).numpy()
+        decoded = (assets.to_scored(offsets, identity) + assets.mesh.template(identity)).numpy()
         # The folder's displacements have 16 bits.
         assert np.abs(animation.vertices - decoded).max() < 1e-4 * np.ptp(decoded - decoded[:1])
 

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 from facediff.errors import MissingExtraError
 from facediff.utils.jobs import PerWorker, SetupError, run_tasks
 from facediff.utils.workers import Mode, WorkerDied
-from tests.fakes.tasks import deadly, failing_setup, raising, square
+from tests.fakes.tasks import counting, deadly, failing_setup, raising, square
 
 ROOT = Path(__file__).parents[2]
 MODES: list[Mode] = ["processes", "threads", "serial"]
@@ -24,16 +23,6 @@ MODES: list[Mode] = ["processes", "threads", "serial"]
 
 def note_threads(_: int) -> str | None:
     return os.environ.get("OMP_NUM_THREADS")
-
-
-def count_calls(base: int) -> Callable[[int], tuple[int, int]]:
-    calls: list[int] = []
-
-    def work(task: int) -> tuple[int, int]:
-        calls.append(task)
-        return os.getpid(), base + len(calls)
-
-    return work
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -59,7 +48,7 @@ def test_the_first_error_is_raised_and_can_be_pickled(mode: Mode) -> None:
 
 
 def test_set_up_happens_once_in_each_worker() -> None:
-    results = [result for _, result in run_tasks(PerWorker(partial(count_calls, 10)), range(8), workers=2)]
+    results = [result for _, result in run_tasks(PerWorker(partial(counting, 10)), range(8), workers=2)]
     by_process: dict[int, list[int]] = {}
     for result in results:
         assert isinstance(result, tuple)

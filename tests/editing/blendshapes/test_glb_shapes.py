@@ -12,9 +12,9 @@ from facediff.editing.blendshapes import SolveOptions, solve
 from facediff.editing.retargeting import retarget_shapes
 from facediff.editing.shapes import read_shapes
 from facediff.mesh import read_mesh
+from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
 from facediff.spaces.shape_files import read_shape_files
-from tests.editing.retarget.test_avatar_round_trip import opened
 from tests.fakes.avatar import AvatarPart, avatar_parts, write_avatar
 from tests.fakes.heads import talking
 
@@ -47,7 +47,7 @@ def test_parts_are_read_together_where_they_are_shown(
     assert found.neutral is not None
     moves = dict(zip(found.names, found.shapes - found.neutral, strict=True))
     first = 0
-    for placed in placed_parts(opened(tmp_path / "a.glb")):
+    for placed in placed_parts(open_glb(tmp_path / "a.glb")):
         part = next(parts[name] for name in parts if f"{name}Material" in placed.names)
         if not part.targets:
             continue

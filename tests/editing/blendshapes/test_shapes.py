@@ -11,6 +11,7 @@ import trimesh
 from facediff.editing.shapes import ShapeSet, read_shapes
 from facediff.errors import FaceDiffError
 from tests.fakes.glb_targets import glb_with_targets
+from tests.fakes.meshes import write_obj
 
 RNG = np.random.default_rng(0)
 GRID = np.array([[x, y, 0.3 * np.sin(2 * x) * np.cos(y)] for y in range(6) for x in range(6)]) * 0.03
@@ -26,16 +27,11 @@ DELTAS = {name: RNG.normal(0, 0.004, GRID.shape) for name in ("jawOpen", "EyeBli
 NAMES = ("eyeBlinkLeft", "browInnerUp", "fancy", "jawOpen")  # files in the order of their names
 
 
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray = FACES) -> None:
-    lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
-    path.write_text("\n".join(lines) + "\n")
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    write_obj(tmp_path / "Neutral.obj", GRID)
+    write_obj(tmp_path / "Neutral.obj", GRID, FACES)
     for name, delta in DELTAS.items():
-        write_obj(tmp_path / f"{name}.obj", GRID + delta)
+        write_obj(tmp_path / f"{name}.obj", GRID + delta, FACES)
     (tmp_path / "notes.txt").write_text("not a mesh")
     return tmp_path
 
@@ -66,7 +62,7 @@ def test_a_folder_of_ply(tmp_path: Path) -> None:
 def test_shapes_in_another_unit_and_with_z_up_are_laid_onto_the_template(folder: Path) -> None:
     turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
     for name, delta in {"Neutral": 0 * GRID, **DELTAS}.items():
-        write_obj(folder / f"{name}.obj", 100 * (GRID + delta) @ turn.T + 7)
+        write_obj(folder / f"{name}.obj", 100 * (GRID + delta) @ turn.T + 7, FACES)
     made = read_shapes(folder, GRID)
     check(made)
     assert any("turned by 90°" in note for note in made.notes)
@@ -76,7 +72,7 @@ def test_shapes_in_another_unit_and_with_z_up_are_laid_onto_the_template(folder:
 def test_without_a_neutral_face_the_template_is_it(tmp_path: Path) -> None:
     deltas = {f"shape{k}": np.where(np.arange(36)[:, None] % 9 == k, RNG.normal(0, 0.01, (36, 3)), 0) for k in range(9)}
     for name, delta in deltas.items():
-        write_obj(tmp_path / f"{name}.obj", GRID + delta)
+        write_obj(tmp_path / f"{name}.obj", GRID + delta, FACES)
     made = read_shapes(tmp_path, GRID)
     check(made, deltas)
     assert any("no neutral face" in note for note in made.notes)
@@ -93,7 +89,7 @@ def test_shapes_that_differ_among_themselves_are_refused(folder: Path) -> None:
         read_shapes(folder, GRID)
     broken = GRID.copy()
     broken[3, 1] = np.nan
-    write_obj(folder / "fancy.obj", broken)
+    write_obj(folder / "fancy.obj", broken, FACES)
     with pytest.raises(FaceDiffError, match=r"fancy.obj: holds NaN"):
         read_shapes(folder, GRID)
     for file in folder.glob("*.obj"):

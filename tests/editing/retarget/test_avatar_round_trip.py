@@ -15,9 +15,10 @@ from facediff.errors import FaceDiffError
 from facediff.export import ExportOptions, write_animations
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
-from facediff.mesh.glb import Glb, has_materials_or_targets
+from facediff.mesh.glb import Glb, has_materials_or_targets, open_glb
 from facediff.mesh.glb_scene import placed_parts
 from tests.fakes.avatar import AvatarPart, avatar_parts, normals_of, write_avatar
+from tests.fakes.glb_reader import without_new_animation
 from tests.fakes.glb_targets import pack
 
 FRAMES = 9
@@ -29,21 +30,17 @@ def parts() -> dict[str, AvatarPart]:
     return avatar_parts(rounds=0)
 
 
-def opened(path: Path) -> Glb:
-    return Glb(path.read_bytes(), path)
-
-
 def talk(path: Path, parts: dict[str, AvatarPart], *, posed: bool = False) -> Animation:
     """The avatar opens its jaw and smiles on one side, as its own targets do."""
     mesh = read_mesh(path)
     rest = mesh.vertices.astype(np.float32)
-    shown = [names for part in placed_parts(opened(path)) if (names := part.names)]
+    shown = [names for part in placed_parts(open_glb(path)) if (names := part.names)]
     vertices = np.repeat(rest[None], FRAMES, axis=0)
     before = 0
     for names in shown:
         part = next(parts[name] for name in parts if f"{name}Material" in names)
         count = len(part.vertices)
-        exact = 2e-6 if "extensionsUsed" not in opened(path).content else 1e-4  # 16 bits of 1.7 m
+        exact = 2e-6 if "extensionsUsed" not in open_glb(path).content else 1e-4  # 16 bits of 1.7 m
         assert posed or rest[before : before + count] == pytest.approx(part.vertices, abs=exact)
         for name, peak in (("jawOpen", 4), ("mouthSmileLeft", 6)):
             weights = np.clip(1 - np.abs(np.arange(FRAMES) - peak) / 4, 0, 1)
@@ -80,11 +77,7 @@ def evaluated(glb: Glb, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
 
 def without_additions(new: dict[str, Any], old: dict[str, Any]) -> dict[str, Any]:
     """The new description less what may be added to the old one."""
-    made = copy.deepcopy(new)
-    for kind in ("accessors", "bufferViews"):
-        del made[kind][len(old.get(kind, [])) :]
-    del made["animations"][0]
-    made["buffers"][0]["byteLength"] = old["buffers"][0]["byteLength"]
+    made = without_new_animation(new, old)
     for mesh, before in zip(made["meshes"], old["meshes"], strict=True):
         count = len(before.get("weights", []))
         if "weights" in mesh:
@@ -113,7 +106,7 @@ def test_an_avatar_keeps_all_it_has(tmp_path: Path, parts: dict[str, AvatarPart]
     write_avatar(tmp_path / "avatar.glb", parts, **LAYOUTS[layout])
     animation = talk(tmp_path / "avatar.glb", parts, posed=LAYOUTS[layout].get("posed", False))
     add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.01)
-    old, new = opened(tmp_path / "avatar.glb"), opened(tmp_path / "out.glb")
+    old, new = open_glb(tmp_path / "avatar.glb"), open_glb(tmp_path / "out.glb")
     assert new.binary.startswith(old.binary)
     idle, kept = old.content["animations"][0], new.content["animations"][1]
     changed = kept["samplers"][1]
@@ -150,7 +143,7 @@ def test_vertices_and_normals_move_as_the_animation_has_it(
     write_avatar(tmp_path / "avatar.glb", parts, **LAYOUTS[layout])
     animation = talk(tmp_path / "avatar.glb", parts, posed=LAYOUTS[layout].get("posed", False))
     add_to_glb(tmp_path / "out.glb", tmp_path / "avatar.glb", animation, 0.01)
-    new = opened(tmp_path / "out.glb")
+    new = open_glb(tmp_path / "out.glb")
     starts = np.cumsum([0, *(len(part.local) for part in placed_parts(new))])
     for (name, part), first in zip(
         [(next(n for n in parts if f"{n}Material" in each.names), each) for each in placed_parts(new)],
@@ -184,17 +177,17 @@ def test_the_command_writes_into_the_avatar_unless_the_bare_face_is_asked_for(
     words = ["retarget", str(tmp_path / "talk.npz"), "--target-mesh", str(source), "--accept-poor"]
     assert main([*words, "--carry", "-o", str(tmp_path / "out.glb")]) == 0
     assert "--bare-face" in capsys.readouterr().out
-    kept, had = (opened(path).content for path in (tmp_path / "out.glb", source))
+    kept, had = (open_glb(path).content for path in (tmp_path / "out.glb", source))
     assert [kept["images"], kept["materials"], kept["skins"][0]["joints"]] == [
         had["images"],
         had["materials"],
         had["skins"][0]["joints"],
     ]
     assert main([*words, "-o", str(tmp_path / "bare.glb"), "--bare-face"]) == 0
-    assert not opened(tmp_path / "bare.glb").entries("skins")
+    assert not open_glb(tmp_path / "bare.glb").entries("skins")
     assert main([*words, "-o", str(source)]) == 2
     write_animations(tmp_path / "into.glb", [talk(source, parts)], into=source)
-    assert opened(tmp_path / "into.glb").content["images"] == had["images"]
+    assert open_glb(tmp_path / "into.glb").content["images"] == had["images"]
     with pytest.raises(FaceDiffError, match=r"no effect on a copy of the target \.glb"):
         write_animations(tmp_path / "b.glb", [talk(source, parts)], ExportOptions(key_tolerance=0.3), into=source)
     assert not has_materials_or_targets(tmp_path / "talk.npz")
@@ -211,21 +204,21 @@ def test_a_mesh_shown_twice_moves_where_it_should(tmp_path: Path, parts: dict[st
     """Two eyes of one mesh, of which one turns: the other keeps the file's."""
     some = {name: parts[name] for name in ("Head", "EyeLeft")}
     write_avatar(tmp_path / "a.glb", some, unit=1.0, z_up=False, skinned=False, animated=False)
-    glb = opened(tmp_path / "a.glb")
+    glb = open_glb(tmp_path / "a.glb")
     content = glb.content
     eye = next(i for i, node in enumerate(content["nodes"]) if node["name"] == "EyeLeft")
     content["nodes"].append({"name": "EyeRight", "mesh": content["nodes"][eye]["mesh"], "translation": [-0.06, 0, 0]})
     content["nodes"][0]["children"].append(len(content["nodes"]) - 1)
     (tmp_path / "a.glb").write_bytes(pack(content, glb.binary))
     mesh = read_mesh(tmp_path / "a.glb")
-    names = [(part.names[0], len(part.local)) for part in placed_parts(opened(tmp_path / "a.glb"))]
+    names = [(part.names[0], len(part.local)) for part in placed_parts(open_glb(tmp_path / "a.glb"))]
     starts = dict(zip((name for name, _ in names), np.cumsum([0, *(n for _, n in names)]), strict=False))
     vertices = np.repeat(mesh.vertices[None].astype(np.float32), 3, axis=0)
     count = len(parts["EyeLeft"].vertices)
     vertices[1, starts["EyeRight"] : starts["EyeRight"] + count] += np.float32([0, 0.01, 0])
     animation = Animation("gaze", vertices, vertices[0], 25.0, faces=mesh.faces)
     add_to_glb(tmp_path / "out.glb", tmp_path / "a.glb", animation, 0.01)
-    new = opened(tmp_path / "out.glb")
+    new = open_glb(tmp_path / "out.glb")
     left, right = (next(n for n in new.content["nodes"] if n["name"] == name) for name in ("EyeLeft", "EyeRight"))
     assert left["mesh"] == content["nodes"][eye]["mesh"]
     assert "targets" not in new.content["meshes"][left["mesh"]]["primitives"][0]

@@ -9,7 +9,7 @@ import numpy as np
 from facediff.animation import Animation
 from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
-from facediff.mesh.glb import Glb
+from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
 from tests.fakes.glb_targets import File, pack
 from tests.fakes.meshes import relief
@@ -65,13 +65,9 @@ def avatar(path: Path) -> None:
     file.write(path)
 
 
-def opened(path: Path) -> Glb:
-    return Glb(path.read_bytes(), path)
-
-
 def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:
     avatar(tmp_path / "avatar.glb")
-    glb = opened(tmp_path / "avatar.glb")
+    glb = open_glb(tmp_path / "avatar.glb")
     for key in ("nodes", "scenes", "scene", "skins", "animations"):
         del glb.content[key]
     (tmp_path / "bare.glb").write_bytes(pack(glb.content, glb.binary))
@@ -81,7 +77,7 @@ def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:
     vertices[1:, len(rest) // 2 :, 1] += 1.0
     add_to_glb(tmp_path / "out.glb", tmp_path / "bare.glb", Animation("a", vertices, rest, 25.0, mesh.faces), 0.001)
     assert np.array_equal(read_mesh(tmp_path / "out.glb").vertices, mesh.vertices)
-    new = opened(tmp_path / "out.glb")
+    new = open_glb(tmp_path / "out.glb")
     (animation,) = new.content["animations"]
     (channel,) = animation["channels"]
     assert new.content["nodes"][channel["target"]["node"]] == {"mesh": 1}
@@ -90,7 +86,7 @@ def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:
 
 def test_each_skinned_node_of_one_mesh_stands_and_moves_by_its_own_skin(tmp_path: Path) -> None:
     avatar(tmp_path / "avatar.glb")
-    glb = opened(tmp_path / "avatar.glb")
+    glb = open_glb(tmp_path / "avatar.glb")
     content, first = glb.content, len(glb.content["nodes"])
     content["nodes"] += [
         {"name": "far", "translation": [5, 0, 0], "scale": [2, 2, 2]},
@@ -105,7 +101,7 @@ def test_each_skinned_node_of_one_mesh_stands_and_moves_by_its_own_skin(tmp_path
     turn = np.array([[0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, 0.28]])
     expected = {1: 2 * local + [5, 0, 0], 2: local @ turn.T + [0, 7, 0]}
     begins, before = {}, 0
-    for part in placed_parts(opened(tmp_path / "twins.glb")):
+    for part in placed_parts(open_glb(tmp_path / "twins.glb")):
         begins[part.node], before = before, before + len(part.local)
     vertices = np.repeat(mesh.vertices[None].astype(np.float32), 4, axis=0)
     for node in range(first + 2, first + 5):
@@ -114,7 +110,7 @@ def test_each_skinned_node_of_one_mesh_stands_and_moves_by_its_own_skin(tmp_path
         vertices[1:, rows] += np.random.default_rng(node).normal(0, 1, (3, len(local), 3)).astype(np.float32)
     animation = Animation("twins", vertices, vertices[0], 25.0, faces=mesh.faces, unit="mm")
     add_to_glb(tmp_path / "out.glb", tmp_path / "twins.glb", animation, 0.001)
-    new = opened(tmp_path / "out.glb")
+    new = open_glb(tmp_path / "out.glb")
     motion = new.content["animations"][0]
     rows_of = {each["target"]["node"]: motion["samplers"][each["sampler"]]["output"] for each in motion["channels"]}
     for part in placed_parts(new):

@@ -19,9 +19,9 @@ from facediff.editing.retargeting import parts_with_a_face, retarget, transfer
 from facediff.editing.surface import Surface
 from facediff.errors import FaceDiffError, OptionError
 from facediff.mesh import Mesh, read_mesh
+from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
 from facediff.mesh.parts import mesh_parts, named_triangles
-from tests.editing.retarget.test_avatar_round_trip import opened
 from tests.fakes.avatar import avatar_parts, write_avatar
 from tests.fakes.heads import APART, BALLS, TILTED, coarser, joined, only, second, talking, talking_second, turned
 
@@ -217,7 +217,7 @@ def test_a_whole_avatar_talks(
     made = read_archive(tmp_path / "o.npz")
     assert len(made.template) == sum(len(part.vertices) for part in parts.values())
     moved, first = {}, 0
-    for placed in placed_parts(opened(tmp_path / "avatar.glb")):
+    for placed in placed_parts(open_glb(tmp_path / "avatar.glb")):
         name = next(name for name in parts if f"{name}Material" in placed.names)
         moved[name] = (made.vertices[3] - made.template)[first : first + len(placed.local)]
         first += len(placed.local)
