@@ -252,6 +252,7 @@ def write_inputs(folder: Path, run: object) -> None:
     from facediff.animation import Animation, write_archive
     from tests.fakes import biwi, flame, mead3d, person, published, study, vocaset
     from tests.fakes.benchmark import write_benchmark
+    from tests.fakes.meshes import write_obj
     from tests.fakes.tiny import write_tiny
 
     assert callable(run)
@@ -324,10 +325,3 @@ def write_inputs(folder: Path, run: object) -> None:
     person.write_speech(folder / "person.wav", person.FRAMES / person.RATE)
     np.save(folder / "person.npy", person.person().seen.astype(np.float32))
     person.write_take(folder / "take.csv", person.FRAMES / person.RATE)
-
-
-def write_obj(path: Path, vertices: object, faces: object) -> None:
-    """A plain OBJ file."""
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]  # type: ignore[attr-defined]
-    lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]  # type: ignore[operator]
-    path.write_text("\n".join(lines) + "\n")

@@ -509,36 +509,24 @@ class Driller:
         elif run.status not in allowed:
             self.note("ill-mannered", f"status {run.status}, expected {allowed}: {said.strip()[-200:]}")
 
-    def judge_files(
-        self, place: Path, changed: Sequence[str] = (), *, clean: bool = False, other_inputs: bool = False
-    ) -> None:
+    def judge_files(self, place: Path, *, clean: bool = False) -> None:
         """Right after a fault: every file is the earlier one or the finished one.
 
         Args:
             place: the round's folder.
-            changed: files that the fault itself has changed.
             clean: whether nothing else may be there, since the command could tidy up.
-            other_inputs: whether the inputs were others, so that what is made piece by piece may be as well.
         """
         found = tree(place / "work")
         for name in self.before:
             mine = (self.before[name], self.after.get(name, ""))
-            if name in changed or name.endswith("/"):
-                continue
-            if self.in_pieces(name):
+            if name.endswith("/") or self.in_pieces(name):
                 continue
             if name not in found:
                 self.note("lost", f"{name} is gone")
             elif found[name] not in mine:
                 self.note("corrupt", f"{name} is neither the earlier nor the finished file")
         for name in found.keys() - self.before.keys():
-            made_of_others = other_inputs and self.drill.pieces
-            if (
-                name in self.after
-                and found[name] != self.after[name]
-                and not self.in_pieces(name)
-                and not made_of_others
-            ):
+            if name in self.after and found[name] != self.after[name] and not self.in_pieces(name):
                 self.note("corrupt", f"{name} is not the finished file")
             if clean and name not in self.after and not self.drill.pieces:
                 self.note("left over", f"{name} is there after an orderly end")
@@ -547,7 +535,7 @@ class Driller:
         """Whether a file grows during the run, or is the state of the run, which the next run shows to be whole."""
         return self.drill.pieces and name.endswith((".csv", ".yaml", ".json", ".lock", "last.ckpt"))
 
-    def judge_again(self, place: Path, changed: Sequence[str] = ()) -> None:
+    def judge_again(self, place: Path) -> None:
         """Run the command again: what is there equals what an uninterrupted run leaves."""
         finished = self.drill.once and tree(place / "work") == self.after
         run = execute(self.drill.argv(), place)
@@ -557,14 +545,12 @@ class Driller:
             self.note("wrong", f"the next run ended with {run.status}: {(run.out + run.err).strip()[-300:]}")
             return
         self.judge_manners(run, (0,))
-        self.judge_result(place, changed)
+        self.judge_result(place)
 
-    def judge_result(self, place: Path, changed: Sequence[str] = ()) -> None:
+    def judge_result(self, place: Path) -> None:
         """All files equal the uninterrupted run's."""
         found = tree(place / "work")
         for name, mark in self.after.items():
-            if name in changed:
-                continue
             if name not in found:
                 self.note("lost", f"{name} is not there after the next run")
             elif found[name] != mark:
@@ -574,16 +560,9 @@ class Driller:
 
     # Faults
 
-    def moment(self) -> dict[str, Any]:
-        """When to strike: at a write, soon after one, or at any time."""
-        if self.random.random() < 0.5 and self.whole.points:
-            late = self.random.choice([0.0, self.random.uniform(0, 0.05)])
-            return {"point": self.random.randint(1, self.whole.points), "delay": late}
-        return {"after": self.random.uniform(0, 1.05 * self.whole.seconds)}
-
     def kill(self, score: Score) -> None:
         """Kill -9, then run again."""
-        moment = self.moment()
+        moment = moment_of(self.whole, self.random, 0.5)
         with self.round(score, f"SIGKILL {moment}") as place:
             run = execute(self.drill.argv(), place, **moment)
             score.struck += run.status == -signal.SIGKILL
@@ -593,7 +572,7 @@ class Driller:
     def stop(self, score: Score) -> None:
         """SIGTERM or Ctrl-C, then run again."""
         number = self.random.choice([signal.SIGTERM, signal.SIGINT])
-        moment = self.moment()
+        moment = moment_of(self.whole, self.random, 0.5)
         with self.round(score, f"{signal.Signals(number).name} {moment}") as place:
             run = execute(self.drill.argv(), place, number=number, **moment)
             score.struck += run.status != 0
@@ -635,6 +614,14 @@ class Driller:
         folder.mkdir(exist_ok=True)
         (folder / "matplotlib").mkdir(exist_ok=True)
         return folder
+
+
+def moment_of(run: Run, chance: random.Random, share: float) -> dict[str, Any]:
+    """When to strike: in a share of the rounds at a write or soon after one, else at any time of a whole run."""
+    if chance.random() < share and run.points:
+        late = chance.choice([0.0, chance.uniform(0, 0.05)])
+        return {"point": chance.randint(1, run.points), "delay": late}
+    return {"after": chance.uniform(0, 1.05 * run.seconds)}
 
 
 def copy(source: Path, target: Path) -> None:
@@ -703,7 +690,7 @@ class FitDriller:
             missing = [fault for fault in wanted if self.scores[fault].struck < wanted[fault]]
             fault = self.random.choice(missing) if missing and attempt < self.MOST_ATTEMPTS else ""
             number = signal.SIGKILL if fault != "stop" else self.random.choice([signal.SIGTERM, signal.SIGINT])
-            moment = self.moment() if fault else {}
+            moment = moment_of(self.whole, self.random, 0.7) if fault else {}
             resumes = any(place.rglob("last.ckpt"))
             words = [*self.WORDS, *(["--ckpt_path", "last"] if resumes else [])]
             run = execute(words, place, number=number, **moment)
@@ -731,13 +718,6 @@ class FitDriller:
         for file in found.keys() - self.expected.keys():
             score.note("left over", f"fit, {name}: {file}; {story}")
         shutil.rmtree(place)
-
-    def moment(self) -> dict[str, Any]:
-        """When to strike; writes are the moments of steps, logs and checkpoints."""
-        if self.random.random() < 0.7:
-            late = self.random.choice([0.0, self.random.uniform(0, 0.05)])
-            return {"point": self.random.randint(1, self.whole.points), "delay": late}
-        return {"after": self.random.uniform(0, self.whole.seconds)}
 
 
 # The whole drill
@@ -811,18 +791,18 @@ def separately(
 
 def table(results: dict[str, dict[str, Score]]) -> str:
     """The counts as Markdown: a line for each command, with rounds by fault."""
+    from facediff.reporting.documents import markdown_table
+
     head = ["command", *FAULTS, *COUNTS]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    totals: Counter[str] = Counter()
+    rows, totals = [], Counter[str]()
     for name, scores in results.items():
         row = Counter[str]()
         for fault, score in scores.items():
             row[fault] += score.struck if fault in ("kill", "stop") else score.rounds
             row.update(score.counts)
         totals.update(row)
-        lines.append(f"| `{name}` | " + " | ".join(str(row[key]) for key in head[1:]) + " |")
-    lines.append("| all | " + " | ".join(str(totals[key]) for key in head[1:]) + " |")
-    return "\n".join(lines)
+        rows.append([f"`{name}`", *(row[key] for key in head[1:])])
+    return markdown_table(head, [*rows, ["all", *(totals[key] for key in head[1:])]])
 
 
 def options(words: Sequence[str] | None = None) -> argparse.Namespace:

@@ -377,9 +377,7 @@ class Bench:
                 middle = made[round(start * rate) : round(start * rate) + len(true)]
                 ends.append(self.squared_error(middle, true[: len(middle)]))
         return {
-            "opening": float(np.concatenate(opened).mean()),
-            "widest": float(np.concatenate(opened).max()),
-            "tremble": float(np.concatenate(trembled).mean()),
+            **_of_silence(opened, trembled),
             "LVE onset": float(np.concatenate(onsets).mean()),
             "LVE speech": float(np.concatenate(ends).mean()),
         }
@@ -391,11 +389,12 @@ class Bench:
             made = self.animate(make(4 * SAMPLE_RATE), sample)
             opened.append(self.opening(made))
             trembled.append(np.linalg.norm(np.diff(made[:, self.lips], axis=0), axis=-1).mean(1))
-        return {
-            "opening": float(np.concatenate(opened).mean()),
-            "widest": float(np.concatenate(opened).max()),
-            "tremble": float(np.concatenate(trembled).mean()),
-        }
+        return _of_silence(opened, trembled)
+
+
+def _of_silence(opened: Sequence[Array], trembled: Sequence[Array]) -> dict[str, float]:
+    mouths, steps = np.concatenate(opened), np.concatenate(trembled)
+    return {"opening": float(mouths.mean()), "widest": float(mouths.max()), "tremble": float(steps.mean())}
 
 
 def _chance(shut: npt.NDArray[np.bool_], length: int) -> float:
