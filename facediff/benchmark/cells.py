@@ -7,7 +7,6 @@ concerns, and finds the results of all others.
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import json
 import os
@@ -34,6 +33,7 @@ from facediff.errors import FaceDiffError, check_known
 from facediff.utils.checksums import describe_files, file_stamps, sha256
 from facediff.utils.files import short_name
 from facediff.utils.hub import check_model_source, model_hash
+from facediff.utils.provenance import hash_of
 from facediff.utils.yaml_files import load_yaml
 
 Kind = Literal["fit", "checkpoint", "predictions"]
@@ -88,11 +88,6 @@ class Cell:
     def _stem(self) -> str:
         parts = [self.row, self.corpus, *([] if self.seed is None else [f"seed{self.seed}"])]
         return short_name("-".join(re.sub(r"[^\w.+]+", "_", word) for word in parts), 100)
-
-
-def hash_of(content: object) -> str:
-    """SHA-256 of plain data with sorted keys."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def with_code(content: Mapping[str, Any]) -> dict[str, Any]:

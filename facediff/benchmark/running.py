@@ -20,13 +20,14 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from facediff.benchmark.cells import Cell, Training, hash_of, training_content, with_code
+from facediff.benchmark.cells import Cell, Training, training_content, with_code
 from facediff.benchmark.results import Result, cell_file, model_result, predictions_result, read_result
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
 from facediff.utils.files import discard
 from facediff.utils.plain_files import load_json, read_json, write_json
+from facediff.utils.provenance import hash_of
 from facediff.utils.workers import THREAD_VARIABLES
 
 RUNS, LOGS = "runs", "logs"

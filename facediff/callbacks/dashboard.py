@@ -21,7 +21,7 @@ from facediff.models import AnimationModel
 from facediff.utils.checksums import sha256
 from facediff.utils.hints import checks_arguments
 from facediff.utils.hub import model_hash, split_face
-from facediff.utils.provenance import Provenance, recipe_of
+from facediff.utils.provenance import Provenance, hash_of
 from facediff.version import __version__
 
 
@@ -107,7 +107,7 @@ def provenance_of(trainer: Trainer, model: AnimationModel, data: SpeechMotionDat
     return Provenance(
         model=facts["model"],
         components={key.partition("/")[2]: name for key, name in facts.items() if key.startswith("component/")},
-        recipe=recipe_of({"model": options, "data": trained}),
+        recipe=hash_of({"model": options, "data": trained}),
         seed=int(seed) if seed.isdecimal() else None,
         steps=int(steps) if steps.isdecimal() else None,
         checkpoint=model_hash(path) if path is not None and path.exists() else "",

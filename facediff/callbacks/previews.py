@@ -324,7 +324,6 @@ def draw_clip(
         motion.numpy() + template,
         highest=error_scale,
         scale_label=length(error_scale, assets.unit),
-        labels=("truth", "facediff", "error"),
         footer=f"{sample.name} after epoch {epochs}: {lip_score(clip_scores)} ({corpus})",
     )
     count, rate = len(motion), assets.frame_rate

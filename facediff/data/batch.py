@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -370,15 +370,6 @@ class Assets:
     ) -> Float[Tensor, "*frames scored_points scored_dims"]:
         """Offsets from the template in the form of :attr:`scored`."""
         return motion if self.rig is None else self.rig.decode(motion, self.space, identity)
-
-    def to_vertices(
-        self, motion: Float[Tensor, "*frames points dims"], identity: str
-    ) -> Float[Tensor, "*frames vertices 3"]:
-        """Offsets from the template as offsets of vertices; unchanged where they are of vertices already."""
-        if self.space.is_vertices:
-            return motion
-        _ = self.mesh
-        return cast(Rig, self.rig).decode(motion, self.space, identity)
 
     def template(self, identity: str) -> Float[Tensor, "points dims"]:
         """The neutral face of an identity, in the corpus's unit."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 from facediff import registry
 from facediff.data.corpus import Clip, read_clip_table, read_manifest
-from facediff.data.datamodule import SpeechMotionDataModule, person_licence
+from facediff.data.datamodule import SpeechMotionDataModule, by_speaker, person_licence
 from facediff.data.packed.stores import is_packed
 from facediff.errors import FaceDiffError, check_known
 from facediff.utils.licences import Licence, merged, read_licences
@@ -97,13 +97,10 @@ class People(SpeechMotionDataModule):
     def _splits(self) -> dict[str, str | None]:
         table = {name: row.get("split", "none") for name, row in read_clip_table(self.root).items()}
         check_known(self.root / "clips.csv", "split", table.values(), ("train", "val", "test", "none"))
-        by_person: dict[str, list[str]] = {}
-        for clip in self.corpus.clips.values():
-            if clip.root == self.root:
-                by_person.setdefault(clip.identity, []).append(clip.name)
+        own = by_speaker(clip for clip in self.corpus.clips.values() if clip.root == self.root)
         splits: dict[str, str | None] = {}
-        for person, names in by_person.items():
-            for number, name in enumerate(sorted(names)):
+        for person, clips in own.items():
+            for number, name in enumerate(names := sorted(clip.name for clip in clips)):
                 split = {"test": "test_a", "none": None}.get(table.get(name, "none"), table.get(name))
                 if person not in self.extra_identities:
                     split = None if number % REFERENCE_SHARE == 0 else "test_b"

@@ -89,9 +89,9 @@ def cache_root(seed: int = 0, drawn_speakers: int = 0, people: Sequence[str] = (
     return cache_dir() / f"puppet-{puppet.GENERATOR}-seed{seed}{more}"
 
 
-def made_root(seed: int) -> Path | None:
-    """An existing folder of :func:`cache_root`; None if there is none."""
-    root = cache_root(seed)
+def made_root() -> Path | None:
+    """An existing folder of :func:`cache_root`, of seed 0; None if there is none."""
+    root = cache_root(0)
     return next((folder for folder in (root, *sorted(root.parent.glob(f"{root.name}-*"))) if folder.is_dir()), None)
 
 

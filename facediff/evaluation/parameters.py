@@ -19,7 +19,7 @@ from facediff.metrics import PROTOCOLS, Protocol, Region
 from facediff.spaces import Space
 from facediff.spaces.files import ParameterClip, even, read_parameters
 from facediff.spaces.files.reading import ARRAYS, SUFFIXES
-from facediff.spaces.operations import permuted, with_rotations
+from facediff.spaces.operations import at_rest, permuted, with_rotations
 from facediff.spaces.rigs import LinearRig, decode_flame
 
 AnyRig = LinearRig | Flame
@@ -109,7 +109,7 @@ class ParameterFiles:
         if self.rig is None:
             return Motion(None, channels)
         still = np.array(values, np.float64)
-        still[:, list(self.space.head)] = self._at_rest()
+        still[:, list(self.space.head)] = at_rest(self.space)[list(self.space.head)]
         if isinstance(self.rig, Flame):
             vertices = decode_flame(self.rig, still, self.space, clip.identity)
         else:
@@ -117,12 +117,6 @@ class ParameterFiles:
             vertices = self.rig.decode(still[:, columns])
         template = torch.from_numpy(np.asarray(self._neutral(self.rig, clip.identity), np.float32))
         return Motion(torch.from_numpy(vertices.astype(np.float32)), channels, template)
-
-    def _at_rest(self) -> list[float]:
-        """The head's channels when it does not turn."""
-        rest = {"six_d": [1.0, 0, 0, 0, 1, 0], "quaternion": [1.0, 0, 0, 0]}
-        turns = (turn for turn in self.space.rotations if turn.joint in ("head", "neck"))
-        return [value for turn in turns for value in rest.get(turn.form, [0.0] * len(turn.channels))]
 
     def regions(self, **stated: object) -> dict[str, Region]:
         """Lips and upper face: vertices of a linear rig that their channels move at least half as far as any.

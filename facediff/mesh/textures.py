@@ -193,7 +193,8 @@ def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str,
                 text = _file_name(rest)
                 if text not in pictures:
                     beside = _beside(path, text)
-                    pictures[text] = beside if beside is not None and _is_picture(beside) else None
+                    known = beside is not None and Material(name, picture=beside).picture_bytes()
+                    pictures[text] = beside if known else None
                 if (picture := pictures[text]) is None:
                     losses.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
                 else:
@@ -233,12 +234,6 @@ def _beside(path: Path, name: str) -> Path | None:
             if file.is_relative_to(folder) and file.is_file():
                 return file
     return None
-
-
-def _is_picture(path: Path) -> bool:
-    with path.open("rb") as stream:
-        start = stream.read(8)
-    return any(start.startswith(magic) for magic in PICTURES)
 
 
 # glTF. Only what other formats have too is read: a colour, or a picture with its coordinates.

@@ -27,6 +27,7 @@ from facediff.mesh.flame import Flame
 from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import even, read_parameters
+from facediff.spaces.operations import at_rest
 from facediff.spaces.rigs import decode_flame
 from facediff.spaces.rotations import convert
 from facediff.synthetic.known_faces import is_built_in
@@ -94,7 +95,7 @@ class Placement:
             return SpokenMotion(self._decoded(values, space), head)
         if space.kind == "flame" and self.flame is not None:
             still = values.copy()
-            still[:, list(space.head)] = space_at_rest(space)[list(space.head)]
+            still[:, list(space.head)] = at_rest(space)[list(space.head)]
             vertices = decode_flame(self.flame, still, space).astype(np.float32)
             rest = np.asarray(self.flame.template, np.float32)
             animation = Animation("FLAME", vertices, rest, 25.0, faces=np.asarray(self.flame.faces, np.int32))
@@ -168,14 +169,6 @@ class Placement:
         else:
             carried = transfer(animation, self._correspondence, target)
         return np.asarray(carried.vertices[:, self.face.points], np.float64)
-
-
-def space_at_rest(space: Space) -> Array:
-    """Values (C,) of a space at rest; all 0 but for rotations of six numbers and quaternions."""
-    rest = np.zeros(len(space.channels))
-    for turn in space.rotations:
-        rest[list(turn.channels)] = convert(np.zeros((1, 3)), "axis_angle", turn.form)[0]
-    return rest
 
 
 def perform(candidate: Candidate, clips: Sequence[SpokenClip], flame: Path | None) -> CandidateMotion | str:

@@ -107,7 +107,6 @@ def comparison(
     *,
     highest: float,
     scale_label: str,
-    labels: tuple[str, str, str] = ("truth", "facediff", "error"),
     footer: str = "",
 ) -> Iterator[Frame]:
     """Frames of the truth, the prediction, and the prediction coloured by each vertex's distance from the truth.
@@ -118,18 +117,18 @@ def comparison(
         prediction: absolute positions (T, V, 3), in the truth's unit.
         highest: distance that gets the last colour, in the motions' unit; equal scales make pictures comparable.
         scale_label: how ``highest`` is written at the colour scale, such as "5 mm".
-        labels: texts above the three panels.
         footer: text under the first two panels.
 
     Returns:
         A generator of T pictures, three panels wide, with strips above and below them.
     """
     heat = heat_colours(np.linalg.norm(np.asarray(prediction) - np.asarray(truth), axis=2), highest)
+    labels = ("truth", "facediff", "error")
     frames = side_by_side(renderer, [truth, prediction, prediction], labels, colours=[None, None, heat])
     ground = renderer.backdrop[-1:]
     height = max(round(0.085 * renderer.height / 2) * 2, 20)
     strip = draw_text(np.repeat(np.hstack([ground, ground]), height, axis=0), footer, colour=INK, scale=0.5)
-    key = _heat_key(np.repeat(ground, height, axis=0), "0", scale_label)
+    key = _heat_key(np.repeat(ground, height, axis=0), scale_label)
     foot = np.hstack([strip, key])
     return (np.concatenate([frame, foot]) for frame in frames)
 
@@ -154,7 +153,7 @@ def heat_colours(values: npt.NDArray[np.floating], highest: float) -> Frame:
     return heat_ramp()[np.clip(levels, 0, 255).astype(np.uint8)]
 
 
-def _heat_key(ground: Frame, lowest: str, highest: str) -> Frame:
+def _heat_key(ground: Frame, highest: str) -> Frame:
     """A copy of a picture (height, width, 3) with the colour map as a bar in its middle, its ends named."""
     height, width, _ = ground.shape
     left, right = round(0.25 * width), round(0.7 * width)
@@ -162,7 +161,7 @@ def _heat_key(ground: Frame, lowest: str, highest: str) -> Frame:
     key = ground.copy()
     levels = np.rint(np.linspace(0, 255, right - left)).astype(np.uint8)
     key[top:bottom, left:right] = heat_ramp()[levels]
-    for text, start, end in ((lowest, max(2 * left - right // 2, 0), left), (highest, right, width)):
+    for text, start, end in (("0", max(2 * left - right // 2, 0), left), (highest, right, width)):
         key[:, start:end] = draw_text(key[:, start:end], text, colour=INK, scale=0.5)
     return key
 

@@ -61,6 +61,14 @@ def permuted(values: Values, source: Space, target: Space) -> tuple[Values, Spac
     return result, replace(target, version=version, rig=source.rig, rig_hash=source.rig_hash, absent=tuple(lacking))
 
 
+def at_rest(space: Space) -> Array:
+    """Values (C,) of a space at rest; all 0 but for rotations of six numbers and quaternions."""
+    rest = np.zeros(len(space.channels))
+    for turn in space.rotations:
+        rest[list(turn.channels)] = convert(np.zeros((1, 3)), "axis_angle", turn.form)[0]
+    return rest
+
+
 def with_rotations(values: Values, space: Space, form: Form, joints: tuple[str, ...] = ()) -> tuple[Array, Space]:
     """Values with their rotations in another form.
 

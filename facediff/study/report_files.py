@@ -38,7 +38,6 @@ def write_report(reports: Sequence[StudyReport], folder: Path) -> list[Path]:
 
     ``table.*`` is the table, ``report.*`` is everything, and ``answers.*`` holds every single answer.
     """
-    answers, texts = answer_rows(reports), comments(reports)
     files = write_texts(
         folder,
         {
@@ -49,9 +48,9 @@ def write_report(reports: Sequence[StudyReport], folder: Path) -> list[Path]:
         },
     )
     for name, rows in (
-        ("table.csv", preference_rows(reports)),
-        ("answers.csv", answers),
-        ("comments.csv", texts),
+        ("table.csv", [_preference_row(report, pair) for report in reports for pair in report.preferences]),
+        ("answers.csv", [row for report in reports for row in _answers(report)]),
+        ("comments.csv", comments(reports)),
     ):
         if rows:
             write_rows(folder / name, rows)
@@ -165,11 +164,6 @@ def text(report: StudyReport) -> str:
 # Plain data.
 
 
-def preference_rows(reports: Sequence[StudyReport]) -> list[dict[str, Any]]:
-    """One flat row for each study, question and pair."""
-    return [_preference_row(report, preference) for report in reports for preference in report.preferences]
-
-
 def _preference_row(report: StudyReport, preference: Preference) -> dict[str, Any]:
     low, high = (end if math.isfinite(end) else None for end in preference.between_raters)
     return {
@@ -191,11 +185,6 @@ def _preference_row(report: StudyReport, preference: Preference) -> dict[str, An
         "p_corrected": preference.p_corrected,
         "raters": len(report.counted),
     }
-
-
-def answer_rows(reports: Sequence[StudyReport]) -> list[dict[str, Any]]:
-    """One flat row for every answer of every rater."""
-    return [row for report in reports for row in _answers(report)]
 
 
 def _answers(report: StudyReport) -> Iterator[dict[str, Any]]:

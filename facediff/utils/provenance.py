@@ -71,9 +71,9 @@ class Provenance:
         write_json(next_to(folder), self.as_dict())
 
 
-def recipe_of(options: Mapping[str, Any]) -> str:
-    """SHA-256 of plain options; it depends neither on their order nor on how numbers were written."""
-    return hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest()
+def hash_of(content: object) -> str:
+    """SHA-256 of plain data with sorted keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def next_to(folder: Path) -> Path:

@@ -37,7 +37,6 @@ FORMAT = "facediff packed corpus 1"
 RECORD = "facediff"
 """The attribute of the group that holds the record."""
 METADATA = "zarr.json"
-SUFFIX = ".zarr"
 STATE = "pack.json"
 """Exists while packing runs or after it was interrupted; ``zarr.json`` of the group appears last."""
 

@@ -47,7 +47,7 @@ def gather(
     folder, of which every ``truth_stride``-th frame is used; ``identity`` is the style of the predictions.
     """
     if truth == Path("puppet") and not truth.is_dir():
-        built_in = made_root(0)
+        built_in = made_root()
         if built_in is None:
             raise FaceDiffError(f"{cache_root()}: the built-in corpus does not exist yet; `facediff demo` makes it")
         truth = built_in
