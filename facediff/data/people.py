@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar
 from facediff import registry
 from facediff.data.corpus import Clip, read_clip_table, read_manifest
 from facediff.data.datamodule import SpeechMotionDataModule, by_speaker, person_licence
+from facediff.data.packed.reader import PackedCorpus
 from facediff.data.packed.stores import is_packed
 from facediff.errors import FaceDiffError, check_known
 from facediff.utils.licences import Licence, merged, read_licences
@@ -25,6 +26,11 @@ def people_of(root: Path) -> list[str]:
     """The people of a corpus, by its manifest, sorted; none where there is no such folder."""
     people = read_manifest(root).get("people") if root.is_dir() else None
     return sorted(people) if isinstance(people, dict) else []
+
+
+def small_files(root: str | Path) -> Path:
+    """The folder of a corpus, or of all files of a packed one but its motion and speech."""
+    return PackedCorpus(root).folder if is_packed(root) else Path(root).expanduser()
 
 
 def unseen_people(names: list[str], share: float) -> list[str]:
@@ -70,7 +76,7 @@ class People(SpeechMotionDataModule):
         test_people: Annotated[float, Range(0, 1)] = 0.2,
         **options: Any,  # noqa: ANN401
     ) -> None:
-        folder = Path(root).expanduser()
+        folder = small_files(root)
         names = people_of(folder)
         unseen = unseen_people(names, test_people)
         identities = extra_identities or [name for name in names if name not in unseen]
@@ -82,7 +88,7 @@ class People(SpeechMotionDataModule):
     def check_root(cls, root: str | Path) -> None:
         """Refuse a folder without people, who are the model's identities."""
         super().check_root(root)
-        if not is_packed(root) and not people_of(Path(root).expanduser()):
+        if not people_of(small_files(root)):
             raise FaceDiffError(f"{root}: its manifest.json names no people. {cls.obtain}")
 
     def licences(self) -> tuple[Licence, ...]:
@@ -97,9 +103,9 @@ class People(SpeechMotionDataModule):
     def _splits(self) -> dict[str, str | None]:
         table = {name: row.get("split", "none") for name, row in read_clip_table(self.root).items()}
         check_known(self.root / "clips.csv", "split", table.values(), ("train", "val", "test", "none"))
-        own = by_speaker(clip for clip in self.corpus.clips.values() if clip.root == self.root)
+        by_person = by_speaker(clip for clip in self.corpus.clips.values() if clip.root == self.root)
         splits: dict[str, str | None] = {}
-        for person, clips in own.items():
+        for person, clips in by_person.items():
             for number, name in enumerate(names := sorted(clip.name for clip in clips)):
                 split = {"test": "test_a", "none": None}.get(table.get(name, "none"), table.get(name))
                 if person not in self.extra_identities:

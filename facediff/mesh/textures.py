@@ -193,8 +193,8 @@ def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str,
                 text = _file_name(rest)
                 if text not in pictures:
                     beside = _beside(path, text)
-                    known = beside is not None and Material(name, picture=beside).picture_bytes()
-                    pictures[text] = beside if known else None
+                    is_picture = beside is not None and Material(name, picture=beside).picture_bytes()
+                    pictures[text] = beside if is_picture else None
                 if (picture := pictures[text]) is None:
                     losses.append(f"the picture {text} is no .png or .jpg in the folder of {path.name}: it is left out")
                 else:

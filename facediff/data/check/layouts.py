@@ -37,6 +37,7 @@ class CorpusFolder:
     motions: dict[str, Path]
     sounds: dict[str, Path]
     n_vertices: int | None
+    source: Path | str  # of the motion: the folder, or the packed corpus
 
     @property
     def names(self) -> list[str]:
@@ -72,7 +73,7 @@ def identify(folder: CorpusFolder, manifest: dict[str, Any], corpus: str | None)
     recorded = manifest.get("corpus")
     module = recognise(folder, recorded) if corpus is None else by_name(corpus, folder.n_vertices)
     if module is not None:
-        return _view_of_module(module, folder.root)
+        return _view_of_module(module, folder.source)
     contents = "there is no wav/*.wav or vertices_npy/*.npy"
     if folder.names:
         vertices = "unreadable motion" if folder.n_vertices is None else f"{number(folder.n_vertices)} vertices"
@@ -104,13 +105,13 @@ def list_folder(root: Path) -> CorpusFolder:
     for name in sorted(motions)[:PROBED]:
         with suppress(Exception):  # reported when the clips are checked
             counts[vertices_of(open_array(rig_path(motions[name]) or motions[name]).shape) or 0] += 1
-    return CorpusFolder(root, motions, sounds, counts.most_common(1)[0][0] or None if counts else None)
+    return CorpusFolder(root, motions, sounds, counts.most_common(1)[0][0] or None if counts else None, root)
 
 
 def list_packed(packed: PackedCorpus) -> CorpusFolder:
     """The clips of a packed corpus, named as the files that they would be."""
     motions = {name: Path(f"vertices_npy/{name}.npy") for name in packed.names()}
-    return CorpusFolder(packed.folder, motions, motions, packed.record.n_vertices)
+    return CorpusFolder(packed.folder, motions, motions, packed.record.n_vertices, packed.source)
 
 
 # The data module that reads it.
@@ -180,7 +181,7 @@ def _import(path: str, option: str) -> Module:
 # The properties that the check needs.
 
 
-def _view_of_module(module: Module, root: Path) -> CorpusView:
+def _view_of_module(module: Module, root: Path | str) -> CorpusView:
     hint: Any = get_type_hints(module.__init__).get("split")
     ways: list[str | None] = list(get_args(hint)) if get_origin(hint) is Literal else [None]
     modules = {way: instance(module, root, way) for way in ways}
@@ -200,7 +201,7 @@ def _view_of_module(module: Module, root: Path) -> CorpusView:
     )
 
 
-def instance(module: Module, root: Path, way: str | None) -> SpeechMotionDataModule:
+def instance(module: Module, root: Path | str, way: str | None) -> SpeechMotionDataModule:
     """The data module of a folder, for one of the ways in which the corpus is split."""
     options: dict[str, Any] = {} if way is None else {"split": way}
     return module(root=str(root), **options)

@@ -143,6 +143,7 @@ class Record:
     clips: Mapping[str, PackedClip] = field(default_factory=dict)  # every clip, by name
     files: Mapping[str, PackedFile] = field(default_factory=dict)  # every other file, by path
     arrays: Mapping[str, ArrayInfo] = field(default_factory=dict)  # the arrays, by name
+    sources: str = ""  # hash of size and time of the corpus's files; empty if packed by facediff 1
 
     @classmethod
     def read(cls, text: bytes, source: str) -> Record:

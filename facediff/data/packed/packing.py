@@ -48,10 +48,12 @@ from facediff.errors import FaceDiffError, needs_extra
 from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import open_sound, refuse_cut_short
 from facediff.utils.batch import begin_folder, do_all
+from facediff.utils.checksums import file_stamps
 from facediff.utils.files import atomic, check_writable, locked
 from facediff.utils.limits import quoted
 from facediff.utils.paths import name_of_file
 from facediff.utils.plain_files import parse_json
+from facediff.utils.provenance import hash_of
 from facediff.utils.ranges import Range, checked
 
 if TYPE_CHECKING:
@@ -158,7 +160,6 @@ class PackingPlan:
     record: Record  # without the shards' sizes, the speech and the files
     files: tuple[str, ...]  # other files of the folder, by path below it
     left_out: tuple[str, ...]  # files of motion or speech that no clip has
-    sources: str  # hash of size and time of every file that is packed; a resumed run must find the same
     bytes: int  # of motion and speech
 
     @classmethod
@@ -180,7 +181,7 @@ class PackingPlan:
                 f"{root / 'templates.pkl'}: has an identity {quoted(odd[0])}; expected plain names, without / \\ : and "
                 f"no leading dot"
             )
-        clips, arrays, left_out, size, sources = {}, {}, [], 0, hashlib.sha256()
+        clips, arrays, left_out, size = {}, {}, [], 0
         rows = dict.fromkeys(CODINGS, 0)
         exact_clips = scored_clips(root, view) if tolerance and exact == "test" else frozenset()
         sounds = {name_of_file(path): path for path in sorted((root / "wav").glob("*.wav"))}
@@ -207,10 +208,7 @@ class PackingPlan:
             clips[name] = PackedClip(name, clip.identity, coding, dtype, rows[coding], motion.frames, silence)
             # Each clip begins at a chunk of its own, so that reading a window decodes no other clip.
             rows[coding] += -(-motion.frames // chunk) * chunk
-            for file in (path, sounds[name]):
-                status = file.stat()
-                size += status.st_size
-                sources.update(f"{file.name} {status.st_size} {status.st_mtime_ns}\n".encode())
+            size += path.stat().st_size + sounds[name].stat().st_size
         if not clips:
             raise FaceDiffError(f"{root}: no clip with both wav/<clip>.wav and vertices_npy/<clip>.npy; {REMEDY}")
         width = 3 * view.n_vertices
@@ -218,6 +216,7 @@ class PackingPlan:
             stored = CODINGS[coding]
             chunks = min(max(1, SHARD_BYTES // (chunk * width * stored.itemsize)), rows[coding] // chunk)
             arrays[f"motion_{coding}"] = ArrayInfo(stored.name, rows[coding], width, chunk, chunks, ())
+        state = [stamp for stamp in file_stamps(root) if "/." not in f"/{stamp[0]}"]
         record = Record(
             made_by=version(),
             corpus=view.corpus,
@@ -230,13 +229,14 @@ class PackingPlan:
             identities=tuple(sorted(templates)),
             clips=clips,
             arrays=arrays,
+            sources=hash_of(state),
         )
-        return cls(root, record, _other_files(root), tuple(left_out), sources.hexdigest(), size)
+        return cls(root, record, _other_files(root), tuple(left_out), size)
 
     @property
     def recipe(self) -> dict[str, Any]:
         """All that determines the output; a run may be resumed only with the same."""
-        names = ("made_by", "corpus", "n_vertices", "frame_rate", "tolerance", "unit", "chunk_seconds")
+        names = ("made_by", "corpus", "n_vertices", "frame_rate", "tolerance", "unit", "chunk_seconds", "sources")
         clips = {name: [clip.coding, clip.frames] for name, clip in self.record.clips.items()}
         return {**{name: getattr(self.record, name) for name in names}, "clips": clips}
 
@@ -293,7 +293,7 @@ def _other_files(root: Path) -> tuple[str, ...]:
 def _carry_out(plan: PackingPlan, out: Path, workers: int | None, scheduler: str | None, quiet: bool) -> PackingReport:
     if (out / METADATA).is_file():
         return _finished(plan, out)
-    begin_folder(out, STATE, {**plan.recipe, "state of the corpus": plan.sources}, "facediff data pack")
+    begin_folder(out, STATE, plan.recipe, "facediff data pack")
     # Every task writes one file, which appears whole or not at all: a file that exists is finished.
     tasks = [task for task in plan.tasks() if not (out / task.target).is_file()]
     work = partial(_write, out, plan.root, plan.record)
@@ -307,7 +307,9 @@ def _finished(plan: PackingPlan, out: Path) -> PackingReport:
     """The report of a corpus that an earlier run has packed; sizes are compared, `data check` reads every byte."""
     record = Record.read((out / METADATA).read_bytes(), str(out))
     if replace(plan, record=record).recipe != plan.recipe:
-        raise FaceDiffError(f"{out}: holds a corpus that was packed otherwise; choose a new folder, or remove this one")
+        raise FaceDiffError(
+            f"{out}: was packed otherwise, or its corpus has changed since; choose a new folder, or remove this one"
+        )
     for name, array in record.arrays.items():
         sizes = {out / name / shard_key(number, array.width): size for number, size in enumerate(array.shards)}
         if odd := [path for path, size in sizes.items() if not path.is_file() or path.stat().st_size != size]:

@@ -13,6 +13,7 @@ import facediff
 from facediff.cli.app import main
 from facediff.data import People
 from facediff.data.corpus import read_clip_table, read_templates
+from facediff.data.packed.packing import pack
 from facediff.data.track.topology import BROWS, LIP_PAIRS
 from facediff.mesh.mesh_files import read_mesh
 from tests.fakes.people import CodedTracker, Look, talking, use_coded_faces, write_coded_video, write_people
@@ -267,6 +268,12 @@ def test_splits_of_one_person_and_of_many(tmp_path: Path) -> None:
     assert by_split["test_b"] == {*unseen} - {"fay"}
     assert all(data.find_split(clip) is None for clip in data.corpus.clips.values() if clip.identity == "fay")
     assert People(root=str(out), extra_identities=["ada"]).identities == ["ada"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FACEDIFF_CACHE", str(tmp_path / "cache"))
+        pack(out, tmp_path / "people.zarr", exact="none", workers=1)
+        packed = People(root=str(tmp_path / "people.zarr"), test_people=0.34)
+        assert packed._splits == data._splits
+        assert main(["data", "check", str(tmp_path / "people.zarr"), "--quick"]) == 0
 
 
 def test_a_video_joins_a_corpus_of_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -300,6 +307,8 @@ def test_a_corpus_keeps_its_own_frame_rate(tmp_path: Path, capsys: pytest.Captur
     data = People(root=str(tmp_path / "people"))
     sample = data.dataset("train", training=True)[0]
     assert (data.frame_rate, data.assets().frame_rate) == (30.0, 30.0)
+    pack(tmp_path / "people", tmp_path / "people.zarr", exact="none", workers=1)
+    assert People(root=str(tmp_path / "people.zarr")).assets().frame_rate == 30.0
     assert abs(len(sample.audio) - len(sample.motion) * 16_000 / 30) < 16_000 / 30
     capsys.readouterr()
     assert main(["data", "check", str(tmp_path / "people"), "--json"]) == 0
