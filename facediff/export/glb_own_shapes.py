@@ -85,12 +85,13 @@ class OwnShapes:
         )
 
     def left_out(self, animation: Animation) -> list[str]:
-        """A sentence for an animation with a moving head, where no bone turns the head."""
-        if animation.head is None or not {"head", "neck"}.isdisjoint(self.bones):
-            return []
-        return [
-            "note: the head's motion is left out, since there is no bone for it; call one Head or Neck, with any prefix"
-        ]
+        """A sentence for each motion of head or jaw that stays out of the avatar's."""
+        notes = []
+        if animation.head is not None and {"head", "neck"}.isdisjoint(self.bones):
+            notes.append("the head's motion is left out, since there is no bone for it; call one Head or Neck")
+        if "jaw" in self.bones and not has_arkit_weights(animation):
+            notes.append("the jaw's bone stays still, since this motion is of vertices; --carry moves the surface")
+        return [f"note: {note}" for note in notes]
 
 
 def own_shapes(target: Path) -> OwnShapes:

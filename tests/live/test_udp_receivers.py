@@ -239,15 +239,15 @@ def test_shapes_that_a_face_lacks_stay_at_zero_and_others_are_left_out(
     listener: Listener, performance: Performance
 ) -> None:
     receiver = open_receiver(f"osc://127.0.0.1:{listener.port}")
-    receiver.open(replace(performance, shapes=("wink", "jawOpen")))
-    receiver.send(replace(frame(0), weights=np.array([0.9, 0.25], np.float32)))
-    found = {each.address: each.params[0] for each in messages(listener.take(2))}
+    receiver.open(replace(performance, shapes=("wink", "jawOpen", "HeadYaw", "HeadPitch", "HeadRoll")))
+    receiver.send(replace(frame(0), weights=np.array([0.9, 0.25, 0.3, -0.2, 0.1], np.float32)))
+    found = {each.address: each.params for each in messages(listener.take(2))}
     receiver.close()
-    assert found.pop("/facediff/weight/jawOpen") == 0.25
+    assert found.pop("/facediff/weight/jawOpen") == [0.25]
     found.pop("/facediff/frame")
-    found.pop("/facediff/head")
+    assert found.pop("/facediff/head") == pytest.approx([0.3, -0.2, 0.1])  # of a model of channels
     assert len(found) == 51
-    assert set(found.values()) == {0.0}
+    assert all(value == [0.0] for value in found.values())
 
 
 def test_a_slow_writer_loses_the_oldest_and_never_blocks() -> None:

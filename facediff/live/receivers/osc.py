@@ -17,7 +17,7 @@ import numpy as np
 from facediff.live.frames import Address, LiveFrame, Performance
 from facediff.live.receivers.sending import ArkitWeights, UdpReceiver
 from facediff.registry import receiver
-from facediff.spaces.arkit import ARKIT, live_link_name
+from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.space import Space
 from facediff.spaces.visemes import SETS, visemes
 
@@ -67,6 +67,7 @@ class _Osc(UdpReceiver):
     def open(self, performance: Performance) -> None:
         """Open the socket."""
         self._weights = ArkitWeights(performance, self.address)
+        self._turns = [performance.shapes.index(name) for name in ROTATIONS[:3] if name in performance.shapes]
         super().open(performance)
 
     @abstractmethod
@@ -135,5 +136,10 @@ class Osc(_Osc):
         """The messages of a frame, in their order."""
         weights = zip(self._parts, self._weights.of(frame).tolist(), strict=True)
         about = message("/facediff/frame", frame.index, float(frame.time), float(frame.lag), frame.dropped)
-        turned = message("/facediff/head", *frame.turned.tolist())
-        return [about, turned, *(part + struct.pack(">f", weight) for part, weight in weights)]
+        # A model of channels turns the head by weights of its own.
+        turned = frame.turned if frame.weights is None or not self._turns else frame.weights[self._turns]
+        return [
+            about,
+            message("/facediff/head", *turned.tolist()),
+            *(part + struct.pack(">f", weight) for part, weight in weights),
+        ]
