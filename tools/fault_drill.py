@@ -579,10 +579,7 @@ class Driller:
             # A process that a signal ends has the same status for the shell as one that ends with 128 + number.
             self.judge_manners(run, (0, 128 + number, -number))
             self.judge_files(place, clean=True)
-            if run.status == 0:
-                self.judge_result(place)
-            else:
-                self.judge_again(place)
+            (self.judge_again if run.status else self.judge_result)(place)
 
     def full(self, score: Score) -> None:
         """A disk with room for a part of what is written; with more room, run again."""
@@ -590,23 +587,17 @@ class Driller:
         with self.round(score, f"room for {room} of {self.written} bytes", self.disk_folder()) as place:
             for name in ("home", "tmp"):
                 (place / name).mkdir(exist_ok=True)
-            for name in ("stdout", "stderr"):
-                (place / name).write_bytes(b"")
-            self.disk.fill(room)
             logs = self.scratch / "logs"  # what is printed must not share the full disk
             logs.mkdir(exist_ok=True)
             for name in ("stdout", "stderr"):
-                (place / name).unlink(missing_ok=True)
                 (place / name).symlink_to(logs / name)
+            self.disk.fill(room)
             run = execute(self.drill.argv(), place)
             self.disk.free()
             score.struck += run.status != 0
             self.judge_manners(run, (0, 1, 2))
             self.judge_files(place, clean=True)
-            if run.status == 0:
-                self.judge_result(place)
-            else:
-                self.judge_again(place)
+            (self.judge_again if run.status else self.judge_result)(place)
 
     def disk_folder(self) -> Path:
         """A folder on the small disk for this command."""

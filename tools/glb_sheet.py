@@ -8,28 +8,15 @@ draws the faces at a few times.
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pygltflib
-from numpy.typing import NDArray
 
-from facediff.render import Renderer, contact_sheet, save_image
-from facediff.utils.colours import to_srgb
-
-COMPONENTS = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC3": 3}
-
-
-def values(gltf: pygltflib.GLTF2, index: int) -> NDArray[Any]:
-    """The numbers of an accessor, (N, components)."""
-    accessor = gltf.accessors[index]
-    view = gltf.bufferViews[accessor.bufferView]
-    width = WIDTHS[accessor.type]
-    start = view.byteOffset + (accessor.byteOffset or 0)
-    flat = np.frombuffer(gltf.binary_blob(), COMPONENTS[accessor.componentType], accessor.count * width, start)
-    return flat.reshape(-1, width)
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from facediff.render import Renderer, contact_sheet, save_image  # noqa: E402
+from facediff.utils.colours import to_srgb  # noqa: E402
+from tests.fakes.glb_reader import Reader  # noqa: E402
 
 
 def main() -> None:
@@ -41,23 +28,15 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=200, help="pixels of a picture")
     args = parser.parse_args()
 
-    gltf = pygltflib.GLTF2().load(str(args.glb))
-    primitive, sampler = gltf.meshes[0].primitives[0], gltf.animations[0].samplers[0]
-    times = values(gltf, sampler.input)[:, 0]
-    weights = values(gltf, sampler.output).reshape(len(times), -1)
-    rest = values(gltf, primitive.attributes.POSITION)
-    shapes = np.stack([values(gltf, target["POSITION"]) for target in primitive.targets])
-    colours = primitive.attributes.COLOR_0
+    glb = Reader(args.glb)
+    colours = glb.primitive.attributes.COLOR_0
     renderer = Renderer(
-        values(gltf, primitive.indices).reshape(-1, 3).astype(np.int32),
-        template=rest,
+        glb.values(glb.primitive.indices).reshape(-1, 3).astype(np.int32),
+        template=glb.values(glb.primitive.attributes.POSITION),
         size=args.size,
-        colours=None if colours is None else to_srgb(values(gltf, colours)),
+        colours=None if colours is None else to_srgb(glb.values(colours)),
     )
-    pictures = []
-    for time in args.times:
-        now = np.clip([np.interp(time, times, column) for column in weights.T], 0, 1)
-        pictures.append(renderer.render(rest + np.tensordot(now, shapes, axes=1)))
+    pictures = [renderer.render(glb.at(time)) for time in args.times]
     save_image(args.png, contact_sheet(pictures, 6, labels=[f"{time:.2f} s" for time in args.times]))
 
 

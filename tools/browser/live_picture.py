@@ -22,22 +22,19 @@ from facediff.synthetic.known_faces import built_in_shapes
 from facediff.utils.hub import BUNDLED
 from tests.fakes.chromium import Chromium, find_chromium
 
-FRAMES, FRAME_RATE, LAG = 60, 30.0, 0.12
+FRAMES, FRAME_RATE, LAG, PORT = 60, 30.0, 0.12, 8350
 
 
 def main(words: list[str] | None = None) -> None:
     """Perform two seconds to a page and write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("picture", type=Path, help=".png")
-    parser.add_argument("--port", type=int, default=8350)
-    parser.add_argument("--width", type=int, default=560)
-    parser.add_argument("--height", type=int, default=620)
     args = parser.parse_args(words)
-    program = find_chromium()
-    if program is None:
-        raise SystemExit("no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)")
+    program = find_chromium() or sys.exit(
+        "no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)"
+    )
     neutral, faces, shapes = built_in_shapes("F1")
-    receiver = open_receiver(f"browser:{args.port}")
+    receiver = open_receiver(f"browser:{PORT}")
     performance = Performance(
         FRAME_RATE,
         neutral.astype(np.float32),
@@ -49,7 +46,7 @@ def main(words: list[str] | None = None) -> None:
     )
     receiver.open(performance)
     with closing(receiver), Chromium(program) as browser:
-        page = browser.open(f"http://127.0.0.1:{args.port}/", width=args.width, height=args.height)
+        page = browser.open(f"http://127.0.0.1:{PORT}/", width=560, height=620)
         page.wait_for("window.facediff && facediff.ready")
         over = threading.Event()
         acting = threading.Thread(target=act, args=(receiver, neutral, shapes, over))

@@ -36,13 +36,10 @@ def main(words: list[str] | None = None) -> None:
     """Run the commands, pick, and write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("picture", type=Path, help=".png")
-    parser.add_argument("--width", type=int, default=1280)
-    parser.add_argument("--height", type=int, default=720)
-    parser.add_argument("--dark", action="store_true")
     args = parser.parse_args(words)
-    program = find_chromium()
-    if program is None:
-        raise SystemExit("no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)")
+    program = find_chromium() or sys.exit(
+        "no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)"
+    )
     head = lower_face()
     command = [sys.executable, "-m", "facediff", "retarget", "talking.npz", "--target-mesh", "mask.obj"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -58,7 +55,7 @@ def main(words: list[str] | None = None) -> None:
             assert process.stdout is not None
             found = re.match(r"\S+", process.stdout.readline())
             assert found is not None
-            page = browser.open(found[0], width=args.width, height=args.height, dark=args.dark)
+            page = browser.open(found[0], width=1280, height=720)
             page.wait_for("window.facediffPicking && document.body.classList.contains('ready')")
             for place, vertex in lower_face_marks(head).items():
                 page.evaluate(f"document.querySelectorAll('#list button')[{list(NAMES).index(place)}].click()")

@@ -32,9 +32,9 @@ def main(words: list[str] | None = None) -> None:
         "--script", action="append", default=[], help="JavaScript to run before, e.g. facediff.heat(true)"
     )
     args = parser.parse_args(words)
-    program = find_chromium()
-    if program is None:
-        raise SystemExit("no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)")
+    program = find_chromium() or sys.exit(
+        "no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)"
+    )
     with Chromium(program) as browser:
         page = browser.open(
             args.page.resolve().as_uri(), width=args.width, height=args.height, dark=args.dark, scale=args.scale

@@ -75,9 +75,9 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--picture", type=Path, help=".png")
     parser.add_argument("--frame", type=int, help="take the picture at this frame, and measure nothing")
     args = parser.parse_args(words)
-    program = find_chromium()
-    if program is None:
-        raise SystemExit("no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)")
+    program = find_chromium() or sys.exit(
+        "no Chromium found: export FACEDIFF_CHROMIUM=$(tools/browser/install.sh FOLDER)"
+    )
     options = [args.model, *(["--runtime", args.runtime] if args.runtime else [])]
     rows = []
     with served(options) as address:
