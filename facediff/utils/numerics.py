@@ -12,8 +12,8 @@ Indices = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.floating]
 Integers = npt.NDArray[np.integer]
 
-CHUNK = 2**22
-"""Distances that are held in memory at a time."""
+CHUNK = 2**19
+"""Distances that are held in memory at a time: 25 MB with their steps."""
 
 BLOCK = 128
 """Samples that pass a filter as one product of matrices."""

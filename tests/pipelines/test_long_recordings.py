@@ -38,6 +38,7 @@ def test_memory_grows_by_the_speech_alone(tmp_path: Path) -> None:
     short, long = (peak_of(seconds, tmp_path / "x.npz", "--blinks") for seconds in (10, 70))
     assert (tmp_path / "x.npz").stat().st_size > 120e6
     assert long - short < 40
+    assert peak_of(10, tmp_path / "x.html") < 300
 
 
 @pytest.mark.slow
