@@ -41,10 +41,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("video", type=Path)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--width", type=int, default=640)
-    parser.add_argument("--quality", type=int, default=60)
     options = parser.parse_args()
-    size = moving_picture(options.video, options.output, width=options.width, quality=options.quality)
+    size = moving_picture(options.video, options.output)
     print(f"{options.output}: {size / 1e6:.2f} MB")
 
 

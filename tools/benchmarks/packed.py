@@ -21,8 +21,7 @@ from facediff.data.puppet import made_root
 from facediff.utils.plain_files import write_json
 
 CLIPS, FRAMES, VERTICES = 16, 160, 23_370
-NOISES = (0.0, 0.01, 0.02, 0.05)
-"""Standard deviations in millimetres."""
+NOISES = (0.0, 0.01, 0.02, 0.05)  # standard deviations in millimetres
 
 
 def write_corpus(root: Path, source: Path, noise: float) -> None:
@@ -48,13 +47,18 @@ def write_corpus(root: Path, source: Path, noise: float) -> None:
     write_json(root / "manifest.json", {"format": 1, "corpus": "biwi", "unit": "m"})
 
 
-source = made_root() or sys.exit("the built-in corpus is not made yet; run `facediff demo`")
-print(machine())
-for noise in NOISES:
-    with tempfile.TemporaryDirectory() as name:
-        write_corpus(Path(name, "corpus"), source, noise)
-        reports = [pack(Path(name, "corpus"), Path(name, f"{lossless}.zarr"), lossless=lossless) for lossless in (0, 1)]
-    plain, *sizes = (
-        size / 1e9 / (reports[0].seconds / 3600) for size in (reports[0].before, *(each.after for each in reports))
-    )
-    print(f"noise {noise} mm: {sizes[0]:.2f} GB an hour, lossless {sizes[1]:.2f}, plain {plain:.1f}", flush=True)
+def main() -> None:
+    """Print the sizes."""
+    source = made_root() or sys.exit("the built-in corpus is not made yet; run `facediff demo`")
+    print(machine())
+    for noise in NOISES:
+        with tempfile.TemporaryDirectory() as name:
+            root = Path(name, "corpus")
+            write_corpus(root, source, noise)
+            rounded, exact = (pack(root, Path(name, f"{e}.zarr"), lossless=e, workers=1) for e in (False, True))
+        sizes = [3600e-9 * size / rounded.seconds for size in (rounded.after, exact.after, rounded.before)]
+        print("noise {} mm: {:.2f} GB an hour, lossless {:.2f}, plain {:.1f}".format(noise, *sizes), flush=True)
+
+
+if __name__ == "__main__":
+    main()
