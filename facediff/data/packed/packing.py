@@ -236,9 +236,10 @@ class PackingPlan:
     @property
     def recipe(self) -> dict[str, Any]:
         """All that determines the output; a run may be resumed only with the same."""
-        names = ("made_by", "corpus", "n_vertices", "frame_rate", "tolerance", "unit", "chunk_seconds", "sources")
+        names = ("made_by", "corpus", "n_vertices", "frame_rate", "tolerance", "unit", "chunk_seconds")
         clips = {name: [clip.coding, clip.frames] for name, clip in self.record.clips.items()}
-        return {**{name: getattr(self.record, name) for name in names}, "clips": clips}
+        settings = {name: getattr(self.record, name) for name in names}
+        return {**settings, "state of the corpus": self.record.sources, "clips": clips}
 
     def tasks(self) -> Iterator[PackingTask]:
         """A task for every shard of motion, and for every clip's speech."""

@@ -174,7 +174,7 @@ def test_a_corpus_that_changed_since_is_not_mixed_with_what_is_there(
         with nullcontext() if whole else pytest.raises(ZeroDivisionError):
             pack(source, tmp_path / "out.zarr", corpus=TINY, workers=1)
     os.utime(source / changed)
-    with pytest.raises(FaceDiffError, match="changed since" if whole else "sources was"):
+    with pytest.raises(FaceDiffError, match="changed since" if whole else "state of the corpus was"):
         pack(source, tmp_path / "out.zarr", corpus=TINY, workers=1)
 
 
