@@ -27,6 +27,7 @@ from facediff.benchmark.plan import (
     MethodEntry,
     Options,
     Variant,
+    beside,
     find_config,
 )
 from facediff.errors import FaceDiffError, check_known
@@ -202,8 +203,7 @@ def _trainings(plan: BenchmarkPlan, row: Row, corpus: CorpusEntry) -> Iterator[T
 
 
 def _source(plan: BenchmarkPlan, kind: Kind, text: str) -> Path:
-    path = Path(text).expanduser()
-    path = path if path.is_absolute() or path.exists() else plan.file.parent / path
+    path = beside(plan.file, text)
     expected = "a folder of predictions, .npy files of vertices"
     if kind == "checkpoint":
         expected = "a file of `facediff fit` or import-checkpoint, or a model folder"

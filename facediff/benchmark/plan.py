@@ -181,7 +181,7 @@ def read_plan(path: Path, roots: Mapping[str, Path] | None = None) -> BenchmarkP
 
 def _corpus(name: str, corpus: CorpusEntry, root: Path | None, path: Path) -> CorpusEntry:
     """The corpus with its paths resolved."""
-    folder = root or (None if corpus.root is None else _beside(path, str(corpus.root)))
+    folder = root or (None if corpus.root is None else beside(path, str(corpus.root)))
     if folder is not None and not folder.is_dir():
         raise FaceDiffError(f"{folder}: no such folder; expected the corpus {name}, give it with --root {name}=FOLDER")
     return replace(
@@ -233,7 +233,7 @@ def check_scores(plan: BenchmarkPlan) -> None:
     check_known(f"{plan.file}: columns", "score", columns, scores)
 
 
-def _beside(plan: Path, text: str) -> Path:
+def beside(plan: Path, text: str) -> Path:
     """A path of the plan: from the working folder, or else from the plan's own."""
     path = Path(text).expanduser()
     return path if path.is_absolute() or path.exists() or not (plan.parent / path).exists() else plan.parent / path
@@ -246,7 +246,7 @@ def bundled_configs(folder: str) -> list[str]:
 
 def find_config(text: str, key: str, plan: Path) -> Path:
     """The file of a config: bundled ones begin with ``configs/``."""
-    bundled, file = config_dir() / text.removeprefix("configs/"), _beside(plan, text)
+    bundled, file = config_dir() / text.removeprefix("configs/"), beside(plan, text)
     if not file.is_file() and text.startswith("configs/") and bundled.is_file():
         file = bundled
     if not file.is_file():

@@ -132,7 +132,7 @@ class RefereeScores:
         """Score one clip."""
         frames = min(len(motion.points), len(truth.points))
         points, true = motion.points[:frames], truth.points[:frames]
-        mouth, true_mouth = self.opening(points), self.opening(true, None)
+        mouth, true_mouth = self.opening(points, self.jaw), self.opening(true, None)
         pair, true_pair = (as_pair(series) for series in (mouth, true_mouth))
         for metric in self._openings.values():
             metric.update(pair, true_pair)
@@ -148,18 +148,17 @@ class RefereeScores:
         if self._closures and closed:
             for name in ("", clip.language):
                 self._closures[name].update(predicted, target, closures=closed)
-            resting = float(self.opening(self.face.rest[None])[0])
+            resting = float(self.opening(self.face.rest[None], self.jaw)[0])
             self._gaps += [1000 * float(mouth[start:end].min() - resting) for start, end in closed]
         furthest, least = round(FURTHEST * self.frame_rate), round(OVERLAP * self.frame_rate)
         self._lags.append(correlations(mouth, true_mouth, furthest, least))
         if motion.head is not None:
             self._turns.append(np.rad2deg(motion.head - motion.head.mean(0)))
 
-    def opening(self, points: Array, jaw: int | None = -1) -> Array:
+    def opening(self, points: Array, jaw: int | None) -> Array:
         """How far the mouth is open in every frame (T,): in metres on the face, else the jaw's channel."""
-        channel = self.jaw if jaw == -1 else jaw
-        if channel is not None:
-            return np.asarray(points[:, channel, 0])
+        if jaw is not None:
+            return np.asarray(points[:, jaw, 0])
         return np.asarray(opening(torch.from_numpy(points), None, self._pair).numpy())
 
     def scores(self) -> dict[str, float]:

@@ -7,7 +7,6 @@ within a second; :mod:`facediff.cli.lightning_cli` runs then.
 from __future__ import annotations
 
 import ctypes
-import difflib
 import importlib
 import inspect
 import json
@@ -35,7 +34,7 @@ from facediff.cli.configs import (
     values_in,
 )
 from facediff.cli.process import StoppedBySignal, tell
-from facediff.errors import FaceDiffError, import_failure
+from facediff.errors import FaceDiffError, choices, import_failure
 from facediff.hyperparameters import plain
 from facediff.utils.files import config_dir
 from facediff.utils.hints import defaults
@@ -297,9 +296,7 @@ def find_config(flag: str, value: str) -> str:
     if not is_config or re.search(r"[\n{]|: ", value):
         return value
     names = [f"configs/{path.relative_to(config_dir()).as_posix()}" for path in config_dir().rglob("*.yaml")]
-    near = difflib.get_close_matches(value, names, n=1)
-    hint = f'did you mean "{near[0]}"?' if near else "the bundled ones are configs/experiment/puppet.yaml and others"
-    raise FaceDiffError(f"--config {value}: no such file; {hint}")
+    raise FaceDiffError(f"--config {value}: no such file; {choices(value, names)}")
 
 
 def experiment_name(arguments: Sequence[str]) -> str | None:

@@ -20,7 +20,7 @@ from facediff.utils.files import cache_dir
 from facediff.utils.paths import find_file, name_of_file
 
 USUAL_SUFFIXES = (".csv", ".json")
-METHOD = 2
+METHOD = 3
 """Goes up when the same recording is read in another way, so that values cached by an older version are not used."""
 
 

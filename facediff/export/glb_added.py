@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import defaultdict
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from facediff.export.glb_writer import ARRAY_BUFFER, GlbWriter
 from facediff.export.motion_shapes import Morphs, compress
 from facediff.mesh.glb import Glb, attributes, open_glb
 from facediff.mesh.glb_scene import Placed, placed_parts
+from facediff.mesh.glb_shapes import target_names
 
 WELD = 1e-6  # Vertices nearer than this share of the mesh's size share a normal's turn: seams of textures stay closed
 
@@ -137,6 +139,9 @@ def _append(
     mesh = glb.entry("meshes", entry["mesh"])
     primitives = glb.primitives(entry["mesh"])
     before = max(len(glb.entries("targets", primitive)) for primitive in primitives)
+    names = [f"target_{k}" for k in range(before)]
+    with suppress(ValueError):  # targets without names
+        names = target_names(glb, entry["mesh"])
     for primitive in primitives:
         new = targets.get(id(primitive))
         if new is None:  # all primitives of a mesh have as many targets
@@ -148,9 +153,10 @@ def _append(
     if "weights" in entry:
         default = [float(weight) for weight in entry["weights"]]
         entry["weights"] = [*default, *[0.0] * count]
-    extras = mesh.setdefault("extras", {})
-    names = list(extras.get("targetNames", [f"target_{k}" for k in range(before)]))
-    extras["targetNames"] = [*names, *(f"facediff_{k:04d}" for k in range(count))]
+    new_names = [f"facediff_{k:04d}" for k in range(before, before + count)]
+    for primitive in primitives:  # where some exporters write them
+        primitive.get("extras", {}).pop("targetNames", None)
+    mesh["extras"] = {**mesh.get("extras", {}), "targetNames": [*names, *new_names]}
     return default, before
 
 

@@ -291,10 +291,12 @@ def _animate(
         count = max(len(glb.entries("targets", primitive)) for primitive in glb.primitives(entry["mesh"]))
         rest = np.array(entry.get("weights", mesh.get("weights", [0.0] * count)), np.float64)
         rows = np.tile(rest, (frames, 1))
-        rows[:, [bind.target for _, bind in binds]] = 0.0
+        driven = [bind.target for _, bind in binds]
+        rows[:, driven] = 0.0
         for shape, bind in binds:
             rows[:, bind.target] += bind.share * tracks[shape]
-        add(node, "weights", np.clip(rows, 0.0, 1.0).astype(np.float32))
+        rows[:, driven] = np.clip(rows[:, driven], 0.0, 1.0)
+        add(node, "weights", rows.astype(np.float32))
     for node, turns in _turns(avatar, weights, _looks_back(glb)):
         add(node, "rotation", _local(glb, node, turns))
     if motion["channels"]:

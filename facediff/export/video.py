@@ -60,11 +60,11 @@ class Gif(Mp4):
     requires = ("PIL", "render")
 
     def write(self, path: Path, animations: Sequence[Animation], options: ExportOptions) -> None:
-        """Write a picture that plays again and again; its frames last whole hundredths of a second."""
+        """Write a picture that plays again and again; its frames last whole hundredths of a second, two at least."""
         from PIL import Image
 
-        rate = options.video_rate or animations[0].frame_rate
-        frames = shown_frames(path, animations, replace(options, size=max(options.size // 3, 16)))
+        rate = min(options.video_rate or animations[0].frame_rate, 50.0)  # browsers play shorter frames slowly
+        frames = shown_frames(path, animations, replace(options, size=max(options.size // 3, 16), video_rate=rate))
         pictures = [Image.fromarray(frame).quantize(dither=Image.Dither.NONE) for frame in frames]
         # Rounded ends, not rounded lengths, keep the pace.
         ends = [round(100 * number / rate) for number in range(len(pictures) + 1)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -124,6 +125,10 @@ def write_animations(
         written = sorted(hidden.iterdir())
         for file in written:
             put_in_place(file, path.with_name(file.name))
+    for target, speech_file in zip(targets, speech_files, strict=True):
+        stale = target.with_suffix(".wav")
+        if form.speech == "next to it" and speech_file is None and stale.is_file() and is_free(stale):
+            warnings.warn(f"{stale}: is of an earlier animation; {target.name} has no speech now", stacklevel=2)
     first = [(folder_of(target) if form.is_folder else target).name for target in targets]
     return [path.with_name(name) for name in [*first, *(file.name for file in written if file.name not in first)]]
 

@@ -73,6 +73,9 @@ class Glb:
     def put_first(self, animation: dict[str, Any]) -> None:
         """Add an animation before the file's own: Blender and viewers start with the first one."""
         self.content["animations"] = [animation, *self.entries("animations")]
+        for node in self.entries("nodes"):  # facediff's facts about the animation that was the first
+            if isinstance(facts := node.get("extras"), dict) and {"frame_rate", "frames"} <= {*facts}:
+                del node["extras"]
 
     def entry(self, kind: str, index: object) -> dict[str, Any]:
         """An object by its number; numbers from the end, which Python would accept, are refused."""

@@ -40,7 +40,7 @@ class Material:
         if self.picture is None:
             return None
         data = self.picture if isinstance(self.picture, bytes) else self.picture.read_bytes()
-        return next((data, *about) for start, about in PICTURES.items() if data.startswith(start))
+        return next(((data, *about) for start, about in PICTURES.items() if data.startswith(start)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,10 +203,8 @@ def _materials(path: Path, libraries: list[str], losses: list[str]) -> dict[str,
                 word == "d" and rest.strip() not in ("1", "1.0")
             ):
                 left_out.add(word)
-        if left_out:
-            losses.append(
-                f"colours and their pictures are carried over, and {', '.join(sorted(left_out))} of {library} left out"
-            )
+        if names := ", ".join(sorted(left_out)):
+            losses.append(f"colours and their pictures are carried over, and {names} of {library} left out")
     return result
 
 

@@ -19,6 +19,7 @@ from facediff.pipelines.stages import Stage, Take
 from facediff.runtime.audio2face import LICENCE, Array, Audio2Face, FaceAnimator
 from facediff.spaces import Rotation, Space
 from facediff.spaces.arkit import ARKIT
+from facediff.spaces.operations import with_apples_mouth
 from facediff.spaces.rotations import convert
 from facediff.speech.voice_activity import OFF
 from facediff.speech.windows import WindowPlan
@@ -141,7 +142,8 @@ class Audio2FacePipeline(AnimationPipeline):
         """With the weights of the face and the tongue, and how jaw and eyes turn."""
         animated = {name: np.concatenate([part[name] for part in self._animated]) for name in self._animated[0]}
         poses = self.model.folder.poses
-        columns = {"skin": solve_weights(self.model, "skin", animation.vertices)}
+        skin = solve_weights(self.model, "skin", animation.vertices)
+        columns = {"skin": with_apples_mouth(skin, poses["skin"].names)}
         if "tongue" in poses:
             columns["tongue"] = solve_weights(self.model, "tongue", animated["tongue_vertices"])
         turned = convert(animated["jaw_transform"][:, :3, :2].swapaxes(1, 2).reshape(-1, 6), "six_d", "axis_angle")
@@ -152,10 +154,7 @@ class Audio2FacePipeline(AnimationPipeline):
         return animation.made_of(self.space(), np.ascontiguousarray(values, np.float32))
 
     def space(self) -> Space:
-        """The channels: the folder's shapes, then the jaw's turn and shift and the eyes' turns, in radians and cm.
-
-        Its ``mouthClose`` closes the mouth over an open jaw, and not Apple's, which is added to ``jawOpen``.
-        """
+        """The channels: the folder's shapes, then the jaw's turn and shift and the eyes' turns, in radians and cm."""
         poses = self.model.folder.poses
         skin = poses["skin"].names
         tongue = (
@@ -167,7 +166,7 @@ class Audio2FacePipeline(AnimationPipeline):
         return Space(
             "arkit",
             (*skin, *tongue, *jaw, *eyes),
-            version="audio2face",
+            version="arkit",
             rig=f"Audio2Face-3D {self.actor}",
             rotations=(
                 Rotation("jaw", first, "axis_angle"),

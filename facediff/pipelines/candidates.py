@@ -146,9 +146,6 @@ class Placement:
         for channel, name in enumerate(ARKIT):
             if name.casefold() in column:
                 weights[:, channel] = values[:, column[name.casefold()]]
-        if space.version == "audio2face":
-            # Audio2Face's mouthClose is a mouth that is closed over an open jaw; Apple's is added to an open jaw.
-            weights[:, ARKIT.index("jawOpen")] += weights[:, ARKIT.index("mouthClose")]
         rig = self.face.rig.only(ARKIT)
         return self.face.rest + np.tensordot(weights, rig.deltas[:, self.face.points], 1)
 
@@ -229,13 +226,9 @@ def _read(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placemen
             animation = read(file, frame_rate=candidate.frame_rate)
             motions[clip.name], rate = placement.animation(animation), animation.frame_rate
         else:
-            arrays = file.suffix in (".npz", ".npy")
-            recorded = even(
-                read_parameters(file, layout=candidate.layout if arrays else None, frame_rate=candidate.frame_rate)
-            )
-            recorded_space = recorded.space
-            space = replace(recorded_space, version="audio2face") if recorded.layout == "audio2face" else recorded_space
-            motions[clip.name], rate = placement.values(recorded.values, space), recorded.frame_rate
+            layout = candidate.layout if file.suffix in (".npz", ".npy") else None
+            recorded = even(read_parameters(file, layout=layout, frame_rate=candidate.frame_rate))
+            motions[clip.name], rate = placement.values(recorded.values, recorded.space), recorded.frame_rate
         if frame_rate is not None and abs(rate - frame_rate) > 1e-6 * rate:
             raise FaceDiffError(
                 f"{file}: has {rate:g} frames a second and the files before it {frame_rate:g}; use one rate"

@@ -127,6 +127,7 @@ def record(graph: Graph) -> onnx.ModelProto:
     """Record a graph with PyTorch's exporter; axes of any length get the names that the graph gives them."""
     import torch
     from torch.export import Dim
+    from torch.utils._sympy.numbers import int_oo
 
     shapes = tuple(dict.fromkeys(graph.axes.get(name, {}), Dim.DYNAMIC) for name in graph.inputs)
     try:
@@ -146,8 +147,12 @@ def record(graph: Graph) -> onnx.ModelProto:
             f"{graph.name}: PyTorch cannot record this part of the model as a graph "
             f"({brief(error.__cause__ or error)}); choose components that do not depend on values, or report it"
         ) from error
-    if program is None:
+    if program is None or program.exported_program is None:
         raise FaceDiffError(f"{graph.name}: PyTorch gave no graph; install the PyTorch that facediff was tested with")
+    if any(lengths.upper != int_oo for lengths in program.exported_program.range_constraints.values()):
+        raise FaceDiffError(
+            f"{graph.name}: a component does otherwise for clips of some length, which a graph cannot; choose another"
+        )
     document: onnx.ModelProto = program.model_proto
     names: dict[str, str] = {}
     for value_info in document.graph.input:

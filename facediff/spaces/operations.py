@@ -5,6 +5,7 @@ Values are (T, C), one column for each channel of a space.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +68,17 @@ def at_rest(space: Space) -> Array:
     for turn in space.rotations:
         rest[list(turn.channels)] = convert(np.zeros((1, 3)), "axis_angle", turn.form)[0]
     return rest
+
+
+def with_apples_mouth(weights: Values, names: Sequence[str]) -> Values:
+    """Audio2Face's weights (T, K) in Apple's meaning, whose ``mouthClose`` is added to ``jawOpen``.
+
+    NVIDIA's closes the mouth over an open jaw, which both of Apple's together do.
+    """
+    weights = weights.copy()
+    if {"jawOpen", "mouthClose"} <= {*names}:
+        weights[:, names.index("jawOpen")] += weights[:, names.index("mouthClose")]
+    return weights
 
 
 def with_rotations(values: Values, space: Space, form: Form, joints: tuple[str, ...] = ()) -> tuple[Array, Space]:

@@ -47,6 +47,12 @@ def test_a_video_for_web_pages_has_speech_and_a_moving_picture_has_none(animatio
         lengths = [frame.info["duration"] for frame in ImageSequence.Iterator(picture)]
         assert picture.width == 64
     assert sum(lengths) == pytest.approx(1000 * 40 / 30, abs=5)
+    # Browsers play frames of 10 ms in 100.
+    write_animations(tmp_path / "b.gif", [replace(animation, frame_rate=60.0)], replace(SMALL, size=192))
+    with Image.open(tmp_path / "b.gif") as picture:
+        lengths = [frame.info["duration"] for frame in ImageSequence.Iterator(picture)]
+    assert min(lengths) >= 20
+    assert sum(lengths) == pytest.approx(1000 * 40 / 60, abs=25)
 
 
 def test_a_video_may_have_more_pictures_than_frames(animation: Animation, tmp_path: Path) -> None:

@@ -205,6 +205,12 @@ def test_speech_next_to_an_export_is_readable_everywhere(animation: Animation, t
     np.testing.assert_array_equal(values / np.float32(32768), animation.speech)
 
 
+def test_speech_of_an_earlier_export_is_named(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
+    write_animations(tmp_path / "a.glb", [make_animation()])
+    with pytest.warns(UserWarning, match=r"a\.wav: is of an earlier animation"):
+        write_animations(tmp_path / "a.glb", [make_animation(speech=None)])
+
+
 def test_csv_holds_weights_solved_for_the_shapes(make_animation: Callable[..., Animation], tmp_path: Path) -> None:
     rest = make_animation().template
     rng = np.random.default_rng(3)

@@ -118,6 +118,19 @@ LAYOUTS: dict[str, dict[str, Any]] = {
 }
 
 
+def test_a_slider_of_the_avatar_stays_where_it_rests(
+    tmp_path: Path, parts: dict[str, AvatarPart], spoken: Animation
+) -> None:
+    write_avatar(tmp_path / "avatar.glb", parts, names={"browInnerUp": "HeadWidth"})
+    glb, at = open_glb(tmp_path / "avatar.glb"), list(parts["Head"].targets).index("browInnerUp")
+    for mesh in glb.content["meshes"]:
+        if "weights" in mesh or "targets" in mesh["primitives"][0]:
+            mesh["weights"] = [-0.5 * (k == at) for k in range(len(parts["Head"].targets))]
+    (tmp_path / "avatar.glb").write_bytes(pack(glb.content, glb.binary))
+    drive_avatar(tmp_path / "out.glb", tmp_path / "avatar.glb", spoken)
+    assert (tracks(open_glb(tmp_path / "out.glb"))["Head", "weights"][:, at] == -0.5).all()
+
+
 @pytest.mark.parametrize("which", LAYOUTS)
 def test_carried_motion_is_solved_for_on_the_avatar(tmp_path: Path, parts: dict[str, AvatarPart], which: str) -> None:
     """A motion that the avatar's shapes can make comes back on every layout."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -29,6 +30,9 @@ def test_frame_rate_and_length_are_read_from_a_face_and_from_an_avatar(
     frames = len(animation.vertices)
     write_animations(tmp_path / "face.glb", [animation])
     assert facts_of(str(tmp_path / "face.glb")) == (25.0, frames)
+    faster = replace(animation, frame_rate=50.0)
+    write_animations(tmp_path / "again.glb", [faster], into=tmp_path / "face.glb")
+    assert facts_of(str(tmp_path / "again.glb")) == (50.0, frames)
     write_avatar(tmp_path / "avatar.glb", avatar_parts(rounds=0))  # with an animation of its own, of one second
     spoken = Animation("x", animation.vertices, animation.template, 30.0, faces=animation.faces)
     spoken = spoken.made_of(layout("arkit"), np.zeros((frames, 52), np.float32))

@@ -93,7 +93,9 @@ def test_animate_gives_vertices_and_what_they_are_made_of(model: Audio2FaceAnima
     assert values is not None
     channels = animation.space.channels
     assert channels[: len(POSES) + len(TONGUE_POSES)] == (*POSES, *TONGUE_POSES)
-    np.testing.assert_allclose(values[:, : len(POSES)], model.solve("skin", animation.vertices), atol=1e-6)
+    solved = model.solve("skin", animation.vertices)
+    solved[:, POSES.index("jawOpen")] += solved[:, POSES.index("mouthClose")]
+    np.testing.assert_allclose(values[:, : len(POSES)], solved, atol=1e-6)
     eyes = {name: values[:, channels.index(f"{name}")] for name in ("right_eye_pitch", "left_eye_yaw")}
     np.testing.assert_allclose(np.rad2deg(eyes["right_eye_pitch"]), animated["eyes_rotation"][:, 0], atol=1e-4)
     np.testing.assert_allclose(np.rad2deg(eyes["left_eye_yaw"]), animated["eyes_rotation"][:, 3], atol=1e-4)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +22,6 @@ def test_weights_move_the_face_as_its_shapes_say() -> None:
     order = [face.rig.names.index(name) for name in ALPHABETICAL]
     moved = np.tensordot(values.astype(np.float64), face.rig.deltas[order], 1)
     assert np.abs(placed.points - (face.rig.neutral + moved)[:, face.points]).max() < 1e-9
-
-
-def test_audio2face_closes_a_mouth_that_is_open() -> None:
-    """Its mouthClose is the pose of an open jaw with closed lips, which is Apple's jawOpen and mouthClose together."""
-    space, face = layout("arkit"), open_face()
-    theirs, apple = np.zeros((1, 52), np.float32), np.zeros((1, 52), np.float32)
-    theirs[0, space.index("mouthClose")] = apple[0, space.index("mouthClose")] = apple[0, space.index("jawOpen")] = 0.4
-    placed = Placement(face).values(theirs, replace(space, version="audio2face"))
-    assert np.abs(placed.points - Placement(face).values(apple, space).points).max() < 1e-9
 
 
 def test_vertices_of_the_built_in_topology_keep_their_displacements() -> None:

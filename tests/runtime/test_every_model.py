@@ -230,6 +230,18 @@ class Branching(torch.nn.Module):
         return motion if motion.sum() > 0 else -motion
 
 
+class ByLength(torch.nn.Module):
+    """Does otherwise for long clips."""
+
+    def forward(self, motion: torch.Tensor) -> torch.Tensor:
+        return motion if motion.shape[1] > 64 else -motion
+
+
+def test_a_part_that_depends_on_the_length_is_refused() -> None:
+    with pytest.raises(FaceDiffError, match="step: a component does otherwise for clips of some length"):
+        record(Graph("step", ByLength(), {"motion": torch.ones(1, 5)}, {"motion": {1: "frames"}}, ("clean",)))
+
+
 def test_a_part_that_depends_on_values_is_refused_in_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(FaceDiffError, match=r"step: .*data-dependent") as caught:
         record(Graph("step", Branching(), {"motion": torch.ones(1, 5)}, {"motion": {1: "frames"}}, ("clean",)))

@@ -216,7 +216,6 @@ class PackingPlan:
             stored = CODINGS[coding]
             chunks = min(max(1, SHARD_BYTES // (chunk * width * stored.itemsize)), rows[coding] // chunk)
             arrays[f"motion_{coding}"] = ArrayInfo(stored.name, rows[coding], width, chunk, chunks, ())
-        state = [stamp for stamp in file_stamps(root) if "/." not in f"/{stamp[0]}"]
         record = Record(
             made_by=version(),
             corpus=view.corpus,
@@ -229,7 +228,7 @@ class PackingPlan:
             identities=tuple(sorted(templates)),
             clips=clips,
             arrays=arrays,
-            sources=hash_of(state),
+            sources=hash_of([stamp for stamp in file_stamps(root) if "/." not in f"/{stamp[0]}"]),
         )
         return cls(root, record, _other_files(root), tuple(left_out), size)
 

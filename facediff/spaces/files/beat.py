@@ -70,9 +70,10 @@ def write_beat(path: Path, clip: ParameterClip) -> None:
         if index not in turning and name not in clip.space.absent
     ]
     times = np.arange(len(clip.values)) / clip.frame_rate if clip.times is None else clip.times
+    start = 0.0 if clip.layout == "live_link" else clip.start  # a take's is the time of day
     frames = [
         # Text and back keeps the shortest decimal of each float32 instead of the digits of its float64.
-        {"weights": [float(str(weight)) for weight in row[shapes]], "time": clip.start + float(time), "rotation": []}
+        {"weights": [float(str(weight)) for weight in row[shapes]], "time": start + float(time), "rotation": []}
         for row, time in zip(clip.values, times, strict=True)
     ]
     content: dict[str, Any] = {"names": [clip.space.channels[index] for index in shapes], "frames": frames}

@@ -13,7 +13,7 @@ from facediff.errors import FaceDiffError, damaged, note
 from facediff.spaces.arkit import ARKIT, ROTATIONS, live_link_name
 from facediff.spaces.files.clips import ParameterClip, checked, columns_of, rate_of, shortest
 from facediff.spaces.layouts import layout
-from facediff.spaces.operations import permuted
+from facediff.spaces.operations import permuted, with_apples_mouth
 from facediff.utils.files import atomic
 from facediff.utils.limits import quoted
 from facediff.utils.numerics import Array, Floats
@@ -204,7 +204,8 @@ def read_audio2face(path: Path) -> ParameterClip:
     table = np.array(cells).reshape(len(cells), -1)
     clock = table[:, 0] if len(table) else np.zeros(0)
     rate = rate_of(path, clock, [f"row {number}" for number in range(2, len(clock) + 2)])
-    values, space = checked(path, table[:, 1:], rate), replace(space, absent=tuple(lacking))
+    values = with_apples_mouth(checked(path, table[:, 1:], rate), space.channels)
+    space = replace(space, absent=tuple(lacking))
     return ParameterClip(path.stem, values, space, rate, clock - clock[0], float(clock[0]), layout="audio2face")
 
 

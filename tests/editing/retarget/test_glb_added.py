@@ -11,6 +11,7 @@ from facediff.export.glb_added import add_to_glb
 from facediff.mesh import read_mesh
 from facediff.mesh.glb import open_glb
 from facediff.mesh.glb_scene import placed_parts
+from facediff.mesh.glb_shapes import target_names
 from tests.fakes.glb_targets import File, pack
 from tests.fakes.meshes import relief
 
@@ -63,6 +64,20 @@ def avatar(path: Path) -> None:
         "extensionsUsed": ["KHR_materials_unlit"],
     }
     file.write(path)
+
+
+def test_names_of_targets_stay_wherever_they_are_written(tmp_path: Path) -> None:
+    avatar(tmp_path / "a.glb")
+    glb = open_glb(tmp_path / "a.glb")
+    glb.primitives(0)[0]["extras"] = glb.content["meshes"][0].pop("extras")
+    (tmp_path / "a.glb").write_bytes(pack(glb.content, glb.binary))
+    mesh = read_mesh(tmp_path / "a.glb")
+    vertices = np.repeat(mesh.vertices[None].astype(np.float32), 3, axis=0)
+    vertices[1:, : len(vertices[0]) // 2, 1] += 1.0
+    for source, output in (("a.glb", "b.glb"), ("b.glb", "c.glb")):  # twice: new names are different
+        add_to_glb(tmp_path / output, tmp_path / source, Animation("a", vertices, vertices[0], 25.0, mesh.faces), 0.001)
+        names = target_names(open_glb(tmp_path / output), 0)
+        assert names[:2] == ["jawOpen", "smile"]
 
 
 def test_meshes_without_nodes_get_nodes_that_move(tmp_path: Path) -> None:

@@ -43,6 +43,12 @@ def test_beat_written_and_read_again_is_the_same(tmp_path: Path) -> None:
     assert (again.space, again.start, again.frame_rate) == (clip.space, clip.start, clip.frame_rate)
 
 
+def test_a_take_written_as_beat_has_no_time_of_day(tmp_path: Path) -> None:
+    clip = read_parameters(written(tmp_path / "a.json", beat()))
+    write_parameters(tmp_path / "b.json", replace(clip, layout="live_link", start=36_000.0))
+    assert read_parameters(tmp_path / "b.json").start == 0
+
+
 def test_absent_weights_are_not_written_as_zero(tmp_path: Path) -> None:
     space = replace(layout("arkit"), absent=("tongueOut",))
     write_parameters(tmp_path / "a.json", ParameterClip("a", np.ones((3, 52), np.float32), space, 30.0))
