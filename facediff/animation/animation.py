@@ -181,8 +181,11 @@ class Animation:
         return self.faces
 
     def part(self, frames: slice | list[int]) -> Self:
-        """The same with some of the frames only; the speech stays whole."""
-        part = replace(self, vertices=self.vertices[frames], head=None if self.head is None else self.head[frames])
+        """The same with some of the frames only; the speech begins with the first of a slice, and else stays whole."""
+        first = frames.indices(len(self.vertices))[0] if isinstance(frames, slice) else 0
+        speech = None if self.speech is None else self.speech[round(first * self.sample_rate / self.frame_rate) :]
+        head = None if self.head is None else self.head[frames]
+        part = replace(self, vertices=self.vertices[frames], head=head, speech=speech)
         return part if self.values is None else part.made_of(self.space, self.values[frames], self.deltas)
 
     def still(self) -> Self:

@@ -47,6 +47,7 @@ class EmaWithWarmup(WeightAveraging):
     def begin(self) -> None:
         """Know nothing of earlier runs."""
         super().__init__(device=self.device, use_buffers=False, multi_avg_fn=self.average)
+        self._swapped = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Copy the whole model; its own set-up by the corpus comes later."""
@@ -82,13 +83,18 @@ class EmaWithWarmup(WeightAveraging):
         if trainer.state.fn == TrainerFn.FITTING:
             super().on_validation_epoch_end(trainer, pl_module)
 
-    def decay_at(self, step: Tensor) -> Tensor:
-        """The decay after a number of averaged steps."""
-        return ((1 + step) / (self.warmup + step)).clamp(max=self.decay)
+    def _swap_models(self, pl_module: LightningModule) -> None:
+        super()._swap_models(pl_module)
+        self._swapped = not self._swapped
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Put the trained weights back where a validation was stopped; a checkpoint may follow."""
+        if self._swapped:
+            self._swap_models(pl_module)
 
     @torch.no_grad()
     def average(self, averages: Sequence[Tensor], weights: Sequence[Tensor], step: Tensor) -> None:
         """Update the averages of weights of one type on one device."""
-        share = (1 - self.decay_at(step.float())).to(averages[0].dtype)
+        share = (1 - ((1 + step.float()) / (self.warmup + step.float())).clamp(max=self.decay)).to(averages[0].dtype)
         for average, weight in zip(averages, weights, strict=True):
             average.lerp_(weight, share)

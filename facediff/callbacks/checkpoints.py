@@ -119,21 +119,23 @@ class LastCheckpoint(Callback):
         self._signals = DeferredSignals()
         self._saved_at = time.monotonic()
         self._saved_step = -1
-        self._seconds = 0.0  # that the last save took
         self._place: str | None = None  # where a checkpoint of this callback is being saved
-        self._resumed: dict[str, Any] = {}
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Become the first callback."""
         callbacks = [callback for callback in trainer.callbacks if callback is not self]  # type: ignore[attr-defined]
         trainer.callbacks = [self, *callbacks]  # type: ignore[attr-defined]
-        self._saved_step, self._seconds, self._resumed = -1, 0.0, {}  # of this run
+        # Of this run: the last step that was saved, the seconds that it took, and where a stopped one was.
+        self._saved_step, self._seconds, self._resumed = -1, 0.0, dict[str, Any]()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock, and let signals wait."""
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         self._saved_at = time.monotonic()
+        path = self.path(trainer)
+        if trainer.logger is None and trainer.ckpt_path is None and trainer.is_global_zero and path.exists():
+            path.rename(path.with_stem(f"{path.stem}-{path.stat().st_mtime:.0f}"))  # of another run
         # Not before: Lightning notes and restores the handlers that it finds when it starts to train.
         self._signals.install()
         if isinstance(data := trainer.datamodule, SpeechMotionDataModule):  # type: ignore[attr-defined]

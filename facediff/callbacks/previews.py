@@ -111,7 +111,7 @@ class SamplingPreview(Callback):
         """Choose the clips, or report why there will be no preview."""
         data = trainer.datamodule  # type: ignore[attr-defined]
         model = require_facediff(self, pl_module, data)
-        self._chosen = []
+        self._chosen, self._scale = [], self.error_scale
         if [callback for callback in trainer.callbacks if type(callback) is type(self)][-1] is not self:  # type: ignore[attr-defined]
             return
         clips = data.clips("val")
@@ -248,17 +248,11 @@ def copy_weights(source: dict[str, Tensor], target: dict[str, Tensor]) -> None:
 @contextmanager
 def borrowed(model: AnimationModel, sampler: str | None, steps: int | None) -> Iterator[None]:
     """A model in evaluation mode with another sampler, if it has that one; both are put back afterwards."""
-    modes = [(module, module.training) for module in model.modules()]
-    model.eval()
-    try:
-        with model.choosing():
-            # Methods with their own way of sampling keep it.
-            if (sampler is not None or steps is not None) and model.has_sampler(sampler):
-                model.choose_sampler(sampler, steps)
-            yield
-    finally:
-        for module, training in modes:
-            module.training = training
+    with model.choosing():
+        # Methods with their own way of sampling keep it.
+        if (sampler is not None or steps is not None) and model.has_sampler(sampler):
+            model.choose_sampler(sampler, steps)
+        yield
 
 
 def first_of_each_identity(clips: Sequence[Clip], count: int) -> list[str]:

@@ -52,6 +52,10 @@ class SpokenSoundsTerm(Callback):
         self.head: nn.Linear | None = None
         self._state: dict[str, Any] = {}
 
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Know nothing of earlier runs; the state of a run that is continued is loaded after it."""
+        self.head, self._state = None, {}
+
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Read the recordings."""
         data = trainer.datamodule  # type: ignore[attr-defined]

@@ -239,7 +239,8 @@ def check_cells(
                 arguments |= {} if cell.root is None else {"root": str(cell.root)}
                 data = data_of(prepared, class_path, arguments, make=not dry_run)
                 if not (dry_run and not data.root.is_dir()):
-                    truths[cell.corpus], clips[cell.corpus] = truth_words(data), test_clips(data)
+                    truths[cell.corpus] = truth_words(data)
+                    clips[cell.corpus] = {clip.name: split for split in data.test_splits for clip in data.clips(split)}
     for cell in left:
         if cell.kind == "checkpoint":
             with naming(plan, cell):
@@ -342,8 +343,3 @@ def truth_words(data: SpeechMotionDataModule) -> tuple[str, ...]:
     """How `facediff evaluate` is told of a corpus's truth."""
     stride = data.corpus.stride
     return (str(data.root), *(["--truth-stride", str(stride)] if stride > 1 else []))
-
-
-def test_clips(data: SpeechMotionDataModule) -> dict[str, str]:
-    """The split of each test clip."""
-    return {clip.name: split for split in data.test_splits for clip in data.clips(split)}

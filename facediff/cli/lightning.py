@@ -312,8 +312,8 @@ def experiment_name(arguments: Sequence[str]) -> str | None:
 
 def config_files(arguments: Sequence[str]) -> list[str]:
     """The files of all ``--config`` options."""
-    named = (value for flag, value in values_in(arguments) if flag in ("-c", "--config"))
-    return [value for value in named if os.path.isfile(value)]  # noqa: PTH113 - a text may be no path at all
+    configs = (value for flag, value in values_in(arguments) if flag in ("-c", "--config"))
+    return [value for value in configs if os.path.isfile(value)]  # noqa: PTH113 - a text may be no path at all
 
 
 def fresh_component(flag: str, value: str) -> str:

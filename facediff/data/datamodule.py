@@ -344,6 +344,7 @@ class SpeechMotionDataModule(LightningDataModule, ABC):
         """Begin a run: models that were trained before asked for other samples."""
         for data in (self, *self.further.values()):
             data.features.reader, data.pair_sentences, data.aligner, data.window_context = None, False, None, (0, 0)
+            data.projection.choose(None)
 
     # The clips.
 

@@ -147,9 +147,6 @@ def normal_shapes(weights: Array, rest: Array, normals: Iterable[Array]) -> Arra
 
 def pseudo_inverse(weights: Array) -> Callable[[slice], Array]:
     """Columns (M, n) of the pseudo-inverse of weights (T, M) for some of the frames, without weak directions."""
-    if weights.nbytes <= LONG_BYTES // 16:
-        inverse = np.linalg.pinv(weights.astype(np.float64), rcond=1e-2).astype(np.float32)
-        return lambda frames: inverse[:, frames]
     # (WᵀW)⁻¹Wᵀ, whose singular values are the roots of WᵀW's: a few columns at a time take no memory.
     gram = np.zeros((weights.shape[1], weights.shape[1]))
     for first in range(0, len(weights), BLOCK):

@@ -276,7 +276,7 @@ class SpreadErrorRatio(OfSamples, RatioMetric):
         if self.squared:
             # Half of the mean squared distance of two samples is their variance, without bias.
             share = (1 + 1 / samples.shape[1]) / 2
-            return share * torch.stack(between).mean(), apart(samples.mean(1), clip.truth)
+            return share * torch.stack(between).mean(), apart(samples.double().mean(1), clip.truth)
         off = [apart(sample, clip.truth) for sample in samples.unbind(1)]
         return torch.stack(between).mean(), torch.stack(off).mean()
 

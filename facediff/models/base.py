@@ -391,6 +391,7 @@ class AnimationModel(CheckpointContent, ABC):
         faces of the training split.
         """
         self._styles_of_step = None
+        self.__dict__.pop("evaluation", None)  # the protocol may be another one now
         data = getattr(self.trainer, "datamodule", None)
         if data is None and self._assets is not None and stage != "test":
             if stage != "predict":

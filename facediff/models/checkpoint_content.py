@@ -22,7 +22,7 @@ from facediff.data.batch import ASSETS_KEY, DATA_SOURCE_KEY, FORMAT, FORMAT_KEY,
 from facediff.errors import FaceDiffError, OptionError, counted
 from facediff.hyperparameters import component_class, describe, plain
 from facediff.models.inference import Inference, Style
-from facediff.models.layers import frame_mask
+from facediff.models.layers import evaluating, frame_mask
 from facediff.registry import COMPONENTS
 from facediff.spaces import Space
 from facediff.speech.voice_activity import OFF, USUAL_GATE
@@ -216,12 +216,8 @@ class CheckpointContent(LightningModule, Inference):
         # functional_call swaps the weights in for the call alone: the model that is training is not touched.
         encoder = StyleEncoding(self)
         prefixed = {f"model.{name}": value for name, value in (weights or {}).items()}
-        # Each module's own mode is restored and not train() called, which would wake up frozen parts in evaluation
-        # mode.
-        modes = [(module, module.training) for module in self.modules()]
-        self.eval()
         styles: dict[str, Style] = {}
-        with torch.no_grad():
+        with torch.no_grad(), evaluating(self):
             for name, clips in data.known_clips().items():
                 total, frames = torch.zeros(()), 0
                 for clip in clips if name in data.corpus.templates else []:
@@ -232,8 +228,6 @@ class CheckpointContent(LightningModule, Inference):
                     total, frames = total + (vectors * lengths[:, None]).sum(0).cpu(), frames + int(lengths.sum())
                 if frames and total.numel():
                     styles[name] = Style(f"all motion of {name} ({counted(len(clips), 'clip')})", total / frames)
-        for module, mode in modes:
-            module.training = mode
         self.person_styles, self._styles_of_step = styles, step
 
 

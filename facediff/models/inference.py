@@ -7,6 +7,7 @@ samples, noise that belongs to a clip or a window, and the blend of windows wher
 
 from __future__ import annotations
 
+import threading
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ from torch import Tensor
 from facediff.data import Assets, Batch, Reference, Sample, collate
 from facediff.errors import FaceDiffError, OptionError, check_known, refuse_idle
 from facediff.models.audio_encoders import AudioEncoder
+from facediff.models.layers import evaluating
 from facediff.speech.audio import samples_for
 from facediff.speech.windows import LOW_LATENCY, FrameClock, MotionWindow, SpeechWindows, WindowPlan
 
@@ -72,6 +74,9 @@ class Prediction:
     identity: str
     reference_name: str
     vertices: Float[Tensor, "frames points dims"]
+
+
+_CHOOSING = threading.RLock()  # one model may serve several threads; of no model, since averages copy them
 
 
 class Inference(ABC):
@@ -338,13 +343,14 @@ class Inference(ABC):
 
     @contextmanager
     def choosing(self, choices: Mapping[str, object] | None = None) -> Iterator[None]:
-        """Within it, earlier :meth:`choices` hold; choices in it are forgotten at its end."""
-        before = self.choices()
-        self._restore(before if choices is None else choices)
-        try:
-            yield
-        finally:
-            self._restore(before)
+        """Within it, the model is in evaluation mode and earlier :meth:`choices` hold; choices in it end with it."""
+        with _CHOOSING, evaluating(self):  # type: ignore[arg-type] # a module, as all models are
+            before = self.choices()
+            self._restore(before if choices is None else choices)
+            try:
+                yield
+            finally:
+                self._restore(before)
 
     def _restore(self, choices: Mapping[str, object]) -> None:
         for name in self.chosen:

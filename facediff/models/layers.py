@@ -140,6 +140,18 @@ def interpolate_ends(features: Float[Tensor, "batch steps dim"], frames: int) ->
     return F.interpolate(features.transpose(1, 2), size=frames, mode="linear", align_corners=True).transpose(1, 2)
 
 
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """A model in evaluation mode; afterwards each part has its own mode, since train() would wake up frozen parts."""
+    modes = [(module, module.training) for module in model.modules()]
+    model.eval()
+    try:
+        yield
+    finally:
+        for module, training in modes:
+            module.training = training
+
+
 def all_states(
     network: nn.GRU | nn.LSTM, x: Float[Tensor, "batch frames dim"], lengths: Int[Tensor, " batch"] | None = None
 ) -> Float[Tensor, "batch frames states"]:

@@ -149,10 +149,10 @@ class Backend(ABC):
 
 
 class TrainedBackend(Backend):
-    """A LightningModule in evaluation mode, with the assets of its corpus."""
+    """A LightningModule with the assets of its corpus; it is in evaluation mode while it animates."""
 
     def __init__(self, module: AnimationModel) -> None:
-        self.module, assets = module.eval(), module.assets
+        self.module, assets = module, module.assets
         self.identities = list(module.identities)
         self.other_identities = sorted({*assets.templates} - {*module.identities})
         self.frame_rate, self.unit, self.n_vertices = module.frame_rate, assets.unit, module.n_vertices
@@ -176,7 +176,8 @@ class TrainedBackend(Backend):
         """The mean style vector (S,) of clips; empty where the model has none."""
         from facediff.models.styles import extract_style
 
-        return extract_style(clips, identity, self.module).numpy()
+        with self.module.choosing():
+            return extract_style(clips, identity, self.module).numpy()
 
 
 class ExportedBackend(Backend):
@@ -430,6 +431,8 @@ class Animator:
         if dtype is not None and options.get("precision", precision) != precision:
             raise OptionError("precision", f"contradicts dtype {dtype}; give one of them", options["precision"])
         options["style"] = with_video_styles(options.get("style"), lambda: self)
+        if self.frame_rate != self.backend.frame_rate:
+            options.setdefault("frame_rate", self.frame_rate)
         settings = AnimationOptions(checkpoint=self.source, **{"precision": precision, **options})
         check_options(settings)
         return settings
@@ -494,11 +497,6 @@ def backend_of(model: AnimationModel | RuntimeModel | Audio2Face) -> Backend:
 
 class Audio2FaceAnimator(Animator):
     """A folder of Audio2Face-3D, with its blendshapes; ``style="joy:0.7,pain:0.2"`` says how strong each emotion is."""
-
-    def _options(self, dtype: DType | None, **options: Any) -> AnimationOptions:  # noqa: ANN401
-        if self.frame_rate != self.backend.frame_rate:
-            options.setdefault("frame_rate", self.frame_rate)
-        return super()._options(dtype, **options)
 
     def solve(self, part: Part, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """NVIDIA's weights (T, K) of the folder's blendshapes for vertices.

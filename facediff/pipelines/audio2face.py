@@ -76,8 +76,7 @@ class Audio2FacePipeline(AnimationPipeline):
             identity=options.identity not in (None, self.actor),
             condition=options.condition not in (None, self.actor),
         )
-        text = _style_text(options)
-        self.emotion = {} if text is None else emotions_of(text)
+        self.emotion = {} if options.style is None else emotions_of(options.style)
         self.model.emotion(self.emotion)  # refuses unknown emotions
         self._animated: list[dict[str, Array]] = []
         template = folder.arrays["skin"]
@@ -263,22 +262,16 @@ def licences_of(model: Audio2Face) -> tuple[Licence, ...]:
     return (replace(LICENCE, of=f"weights of Audio2Face-3D {model.folder.facts.actor}".strip()),)
 
 
-def emotions_of(text: str) -> dict[str, float]:
+def emotions_of(style: object) -> dict[str, float]:
     """Strengths by name.
 
     Example:
-        >>> emotions_of("joy:0.7,pain:0.2"), emotions_of("anger")
-        ({'joy': 0.7, 'pain': 0.2}, {'anger': 1.0})
+        >>> emotions_of("joy:0.7,pain:0.2"), emotions_of("anger"), emotions_of({"fear": 0.5})
+        ({'joy': 0.7, 'pain': 0.2}, {'anger': 1.0}, {'fear': 0.5})
     """
     strengths: dict[str, float] = {}
-    for word in text.split(","):
-        name, colon, number = word.partition(":")
+    parts = [f"{name}:{weight}" for name, weight in style.items()] if isinstance(style, dict) else str(style).split(",")
+    for part in parts:
+        name, colon, number = part.partition(":")
         strengths[name.strip()] = Range(-10, 10).read(f"{{style}}: {name}", number.strip()) if colon else 1.0
     return strengths
-
-
-def _style_text(options: AnimationOptions) -> str | None:
-    """The style as an Audio2Face folder reads it: emotions with their weights."""
-    if isinstance(options.style, dict):
-        return ",".join(f"{name}:{weight}" for name, weight in options.style.items())
-    return None if options.style is None else str(options.style)

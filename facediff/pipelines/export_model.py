@@ -89,7 +89,9 @@ def export_model(
         sizes, described = {}, {}
         for part in graphs.parts:
             document = record(part)
-            store_weights(document, precision if part.name == "speech" else min_precision(precision), part.module)
+            # After the audio encoder, errors add up over the steps.
+            bits: Precision = "float16" if precision == "int8" and part.name != "speech" else precision
+            store_weights(document, bits, part.module)
             path = staged / f"{part.name}.onnx"
             path.write_bytes(document.SerializeToString())
             sizes[path.name] = path.stat().st_size
@@ -150,9 +152,7 @@ def record(graph: Graph) -> onnx.ModelProto:
     if program is None or program.exported_program is None:
         raise FaceDiffError(f"{graph.name}: PyTorch gave no graph; install the PyTorch that facediff was tested with")
     if any(lengths.upper != int_oo for lengths in program.exported_program.range_constraints.values()):
-        raise FaceDiffError(
-            f"{graph.name}: a component does otherwise for clips of some length, which a graph cannot; choose another"
-        )
+        raise FaceDiffError(f"{graph.name}: a component branches on the clip's length, as no graph can; choose another")
     document: onnx.ModelProto = program.model_proto
     names: dict[str, str] = {}
     for value_info in document.graph.input:
@@ -195,11 +195,6 @@ def quiet() -> Iterator[None]:
         config.update("jaxtyping_disable", checked)
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
-
-
-def min_precision(precision: Precision) -> Precision:
-    """The precision of the graphs after the audio encoder: their errors add up over the steps."""
-    return "float16" if precision == "int8" else precision
 
 
 def store_weights(document: onnx.ModelProto, precision: Precision, module: torch.nn.Module) -> None:

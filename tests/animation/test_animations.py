@@ -60,6 +60,12 @@ def test_sound_is_as_long_as_the_picture(animation: Animation) -> None:
     assert not longer[100:].any()
 
 
+def test_a_part_has_the_sound_of_its_time(animation: Animation) -> None:
+    assert animation.speech is not None
+    part = animation.part(slice(2, 4))
+    assert np.array_equal(part.speech, animation.speech[2 * 640 :])  # type: ignore[arg-type]
+
+
 def test_bare_array_needs_a_frame_rate_and_may_be_flat(animation: Animation, tmp_path: Path) -> None:
     np.save(tmp_path / "x.npy", animation.vertices.reshape(5, -1))
     with pytest.raises(FaceDiffError, match="frame_rate"):

@@ -8,6 +8,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 import pytest
+import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from facediff.callbacks import EmaWithWarmup, LastCheckpoint
@@ -17,7 +18,7 @@ from tests.fakes.fixtures import quiet_trainer
 from tests.fakes.tiny import Tiny
 
 
-@pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`")
+@pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`", "ignore:Checkpoint directory")
 def test_runs_after_others(make_model: Callable[..., DualPathDiffusion], tiny_root: Path, tmp_path: Path) -> None:
     def weights_of(folder: str, data: Tiny, callbacks: list[Any], path: Path | None = None) -> dict[str, Any]:
         pl.seed_everything(0)
@@ -42,5 +43,12 @@ def test_runs_after_others(make_model: Callable[..., DualPathDiffusion], tiny_ro
         style_content.make(window_context=True, aligned_windows=True, aligned_pairs=True), datamodule=data
     )
     assert fresh == weights_of("second", data, used)
+    data.projection.choose(torch.flatten)
+    data.setup("fit")
+    assert data.projection.project is None
+    for _ in range(2):
+        bare = quiet_trainer(tmp_path / "bare", logger=False, callbacks=callbacks(), enable_checkpointing=True)
+        bare.fit(make_model(), datamodule=data)
+    assert len([*(tmp_path / "bare").rglob("last*.ckpt")]) == 2, "the first run's is not lost"
     used[0].setup(third := quiet_trainer(tmp_path, callbacks=used, enable_checkpointing=True), make_model(), "fit")
     assert used[0].is_due(third), "nothing of this run is saved yet"

@@ -87,6 +87,9 @@ def make_trainer(tmp_path: Path) -> Callable[..., pl.Trainer]:
     return partial(quiet_trainer, tmp_path)
 
 
+HEADS = {"num_attention_heads": 4, "num_conv_pos_embeddings": 8, "num_conv_pos_embedding_groups": 4}
+
+
 def saved(network: Any, config: Any, folder: Path) -> Path:  # noqa: ANN401 - of transformers
     """The folder, with a network of random weights in it, as transformers saves one."""
     from transformers.utils import logging
@@ -103,15 +106,8 @@ def hubert_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A HuBERT of the published shape (seven convolutions, stride 320) in miniature, with random weights."""
     from transformers import HubertConfig, HubertModel
 
-    config = HubertConfig(
-        hidden_size=32,
-        num_hidden_layers=3,
-        num_attention_heads=4,
-        intermediate_size=48,
-        conv_dim=(16,) * 7,
-        num_conv_pos_embeddings=8,
-        num_conv_pos_embedding_groups=4,
-    )
+    sizes = {"hidden_size": 32, "num_hidden_layers": 3, "intermediate_size": 48, "conv_dim": (16,) * 7}
+    config = HubertConfig(**sizes, **HEADS)
     return saved(HubertModel, config, tmp_path_factory.mktemp("hubert"))
 
 
@@ -128,16 +124,8 @@ def ctc_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wav2vec 2.0 with a CTC head over 29 letters in miniature, of the published shape, with random weights."""
     from transformers import Wav2Vec2Config, Wav2Vec2ForCTC
 
-    config = Wav2Vec2Config(
-        vocab_size=29,
-        hidden_size=16,
-        num_hidden_layers=2,
-        num_attention_heads=4,
-        intermediate_size=24,
-        conv_dim=(8,) * 7,
-        num_conv_pos_embeddings=8,
-        num_conv_pos_embedding_groups=4,
-    )
+    sizes = {"hidden_size": 16, "num_hidden_layers": 2, "intermediate_size": 24, "conv_dim": (8,) * 7}
+    config = Wav2Vec2Config(vocab_size=29, **sizes, **HEADS)
     return saved(Wav2Vec2ForCTC, config, tmp_path_factory.mktemp("ctc"))
 
 

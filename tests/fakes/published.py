@@ -228,17 +228,24 @@ def faceformer_state(dataset: str, seed: int = 0, dim: int = 16) -> State:
     return made | linear_state("obj_vector", dim, len(IDENTITIES), draw, bias=False)
 
 
-def faceformer_reference(s: State, speech: Tensor, dataset: str, identity: int, template: Tensor) -> Tensor:
-    """Absolute vertices (frames, 3V), each frame from all earlier frames again."""
-    features, frames = resampled(features_of(standardised(speech, 1e-5), s, "audio_encoder."), dataset)
+def autoregressive(
+    s: State, speech: Tensor, style: Tensor, ends: tuple[str, str], dataset: str, frames: int | None, epsilon: float
+) -> Tensor:
+    """Offsets (frames, 3V), each frame from all earlier frames again; ``ends`` are layers out of and into tokens."""
+    features, count = resampled(features_of(standardised(speech, epsilon), s, "audio_encoder."), dataset, frames)
     memory = linear(hidden_of(features, s, "audio_encoder."), s, "audio_feature_map")
-    style, table = s["obj_vector.weight"][:, identity], s["PPE.pe"][0]
-    tokens = style[None]
-    for i in range(frames):
+    tokens, table = style[None], s["PPE.pe"][0]
+    for i in range(count):
         made = decoded(tokens + table[: i + 1], memory, s, "transformer_decoder.", dataset)
-        offsets = linear(made, s, "vertice_map_r")
-        tokens = torch.cat([tokens, linear(offsets[-1:], s, "vertice_map") + style])
-    return offsets + template
+        offsets = linear(made, s, ends[0])
+        tokens = torch.cat([tokens, linear(offsets[-1:], s, ends[1]) + style])
+    return offsets
+
+
+def faceformer_reference(s: State, speech: Tensor, dataset: str, identity: int, template: Tensor) -> Tensor:
+    """Absolute vertices (frames, 3V)."""
+    style = s["obj_vector.weight"][:, identity]
+    return autoregressive(s, speech, style, ("vertice_map_r", "vertice_map"), dataset, None, 1e-5) + template
 
 
 # FaceDiffuser.
@@ -362,17 +369,9 @@ def talkingstyle_style(s: State, identity: int) -> Tensor:
 
 
 def talkingstyle_offsets(s: State, speech: Tensor, dataset: str, identity: int, frames: int | None = None) -> Tensor:
-    """Offsets (frames, 3V), each frame from all earlier frames again."""
-    features = features_of(standardised(speech, 1e-7), s, "audio_encoder.")
-    features, frames = resampled(features, dataset, frames)
-    memory = linear(hidden_of(features, s, "audio_encoder."), s, "audio_feature_map")
-    style, table = talkingstyle_style(s, identity), s["PPE.pe"][0]
-    tokens = style[None]
-    for i in range(frames):
-        made = decoded(tokens + table[: i + 1], memory, s, "transformer_decoder.", dataset)
-        offsets = linear(made, s, "vertice_decoder")
-        tokens = torch.cat([tokens, linear(offsets[-1:], s, "vertice_encoder") + style])
-    return offsets
+    """Offsets (frames, 3V)."""
+    style = talkingstyle_style(s, identity)
+    return autoregressive(s, speech, style, ("vertice_decoder", "vertice_encoder"), dataset, frames, 1e-7)
 
 
 # SelfTalk.

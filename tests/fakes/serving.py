@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -47,3 +50,18 @@ def servers() -> Iterator[Servers]:
         yield made
     finally:
         made.stop()
+
+
+def ask(
+    url: str, content: object = None, *, raw: bytes | None = None, **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    """Status, headers in lower case and answer; a POST of JSON if there is anything to send."""
+    body = raw if raw is not None else None if content is None else json.dumps(content).encode()
+    kind = {"Content-Type": "application/json"} if body is not None else {}
+    request = urllib.request.Request(url, body, {**kind, **headers})  # noqa: S310 - our own server
+    try:
+        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
+            return response.status, {key.lower(): value for key, value in response.headers.items()}, response.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, {}, error.read()

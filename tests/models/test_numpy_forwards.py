@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.special
 import torch
+from scipy.special import erf, expit
 from torch import nn
 
 from facediff import registry
@@ -19,7 +21,6 @@ from facediff.models.dual_path.options import DualPathOptions
 Array = np.ndarray
 DIM, HEADS = 16, 4
 LENGTHS = (7, 12, 1)
-ERF = np.vectorize(math.erf)
 
 
 def weights(module: nn.Module) -> dict[str, Array]:
@@ -40,16 +41,10 @@ def norm(x: Array, w: dict[str, Array]) -> Array:
 
 
 def gelu(x: Array) -> Array:
-    return 0.5 * x * (1 + ERF(x / math.sqrt(2)))
+    return 0.5 * x * (1 + erf(x / math.sqrt(2)))
 
 
-def sigmoid(x: Array) -> Array:
-    return 1 / (1 + np.exp(-x))
-
-
-def softmax(x: Array, axis: int = -1) -> Array:
-    e = np.exp(x - x.max(axis, keepdims=True))
-    return e / e.sum(axis, keepdims=True)
+softmax = partial(scipy.special.softmax, axis=-1)
 
 
 def rotate(x: Array) -> Array:
@@ -103,7 +98,7 @@ def gru(x: Array, w: dict[str, Array], suffix: str) -> Array:
         i = w[f"weight_ih_l0{suffix}"] @ frame + w[f"bias_ih_l0{suffix}"]
         h = w[f"weight_hh_l0{suffix}"] @ hidden + w[f"bias_hh_l0{suffix}"]
         (ir, iz, inn), (hr, hz, hn) = np.split(i, 3), np.split(h, 3)
-        reset, update = sigmoid(ir + hr), sigmoid(iz + hz)
+        reset, update = expit(ir + hr), expit(iz + hz)
         hidden = (1 - update) * np.tanh(inn + reset * hn) + update * hidden
         states.append(hidden)
     return np.array(states)
@@ -159,7 +154,7 @@ def step_embedding(n: int, w: dict[str, Array]) -> Array:
     half = DIM // 2
     angle = n * np.exp(-math.log(10_000.0) * np.arange(half) / half)
     x = linear(np.concatenate([np.sin(angle), np.cos(angle)]), under(w, "mlp.0"))
-    return linear(x * sigmoid(x), under(w, "mlp.2"))
+    return linear(x * expit(x), under(w, "mlp.2"))
 
 
 @pytest.fixture(autouse=True)

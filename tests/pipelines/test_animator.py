@@ -6,6 +6,7 @@ import inspect
 import shutil
 import typing
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 import facediff
 from facediff.animation.options import AnimateKeywords, StreamKeywords
 from facediff.cli.app import main
+from facediff.errors import FaceDiffError
 from facediff.models import Style
 from facediff.pipelines.animator import recordings_of
 from facediff.speech.audio import speech_of
@@ -253,6 +255,24 @@ def test_models_that_were_just_made_or_saved_animate_alike(
         assert said in repr(model)
     assert model.identities[0] == "F1"
     assert "F4" in model.other_identities
+
+
+def test_threads_and_training_leave_a_model_as_it_was(saved_model: Path, speech: Path) -> None:
+    model, jobs = facediff.load(saved_model, device="cpu"), [{}, {"steps": 2}, {"expressivity": 0.3}]
+
+    def animate(options: dict[str, float]) -> np.ndarray:
+        return model.animate(speech, seed=1, **options).vertices  # type: ignore[arg-type]
+
+    expected = [animate(options) for options in jobs]
+    with ThreadPoolExecutor(3) as pool:
+        assert all(map(np.array_equal, pool.map(animate, 2 * jobs), 2 * expected))
+    assert np.array_equal(animate({}), expected[0])
+    model.module.train()
+    assert np.array_equal(animate({}), expected[0])
+    assert model.module.training
+    model.frame_rate = 50.0
+    with pytest.raises(FaceDiffError, match="Audio2Face"):
+        animate({})
 
 
 def test_a_list_and_a_folder_give_what_each_recording_gives_alone(

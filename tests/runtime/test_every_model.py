@@ -238,7 +238,7 @@ class ByLength(torch.nn.Module):
 
 
 def test_a_part_that_depends_on_the_length_is_refused() -> None:
-    with pytest.raises(FaceDiffError, match="step: a component does otherwise for clips of some length"):
+    with pytest.raises(FaceDiffError, match="step: a component branches on the clip's length"):
         record(Graph("step", ByLength(), {"motion": torch.ones(1, 5)}, {"motion": {1: "frames"}}, ("clean",)))
 
 

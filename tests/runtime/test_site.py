@@ -6,8 +6,6 @@ import gzip
 import json
 import re
 import sys
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
@@ -23,7 +21,7 @@ from facediff.runtime import onnxruntime_web
 from facediff.runtime.site import PAGE, Site, make_app, make_site, write_site
 from facediff.utils.server import LOOPBACK
 from tests.fakes.exported import write_exported
-from tests.fakes.serving import servers
+from tests.fakes.serving import ask, servers
 
 Serve = Callable[[Site], str]
 
@@ -46,16 +44,6 @@ def runtime(tmp_path: Path) -> dict[str, Path]:
 @pytest.fixture
 def site(runtime: dict[str, Path], tmp_path: Path) -> Site:
     return make_site(write_exported(tmp_path / "<b>face"), runtime)
-
-
-def ask(url: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    request = urllib.request.Request(url, headers=headers)  # noqa: S310 - our own server
-    try:
-        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
-            return response.status, {key.lower(): value for key, value in response.headers.items()}, response.read()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, {}, error.read()
 
 
 def test_every_file_is_offered_as_what_it_is_under_strict_headers(site: Site, serve: Serve) -> None:

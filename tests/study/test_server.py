@@ -19,6 +19,7 @@ from facediff.study.definition import DATABASE, Study
 from facediff.study.server import MOST_BYTES, make_app
 from facediff.study.store import AnswerStore
 from facediff.utils.server import LOOPBACK
+from tests.fakes import serving
 from tests.fakes.serving import servers
 from tests.fakes.study import SCORES, simulate, small_study, write_study
 from tests.study.conftest import Serve
@@ -37,20 +38,10 @@ def address(study: Study, tmp_path: Path, serve: Serve) -> str:
     return serve(write_study(tmp_path / "study", study))
 
 
-def ask(
-    url: str, content: object = None, *, raw: bytes | None = None, kind: str = JSON, **headers: str
-) -> tuple[int, Any]:
-    """Status and answer; a POST if there is anything to send."""
-    body = raw if raw is not None else None if content is None else json.dumps(content).encode()
-    headers |= {"Content-Type": kind} if body is not None else {}
-    request = urllib.request.Request(url, body, headers)  # noqa: S310 - our own server
-    try:
-        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
-            found = response.read()
-            return response.status, json.loads(found) if response.headers["Content-Type"] == JSON else found
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read()
+def ask(url: str, content: object = None, **options: Any) -> tuple[int, Any]:  # noqa: ANN401 - passed on
+    """Status and answer; of JSON, its content."""
+    status, headers, answer = serving.ask(url, content, **options)
+    return status, json.loads(answer) if headers.get("content-type") == JSON else answer
 
 
 def given(asked: Study, number: int, place: int = 0, **changed: object) -> dict[str, object]:
@@ -115,7 +106,7 @@ def test_bodies_of_other_kinds_and_sizes_are_refused(address: str, study: Study)
     assert ask(url, raw=b"\xff\xfe{")[0] == 400
     assert ask(url, raw=b"[1, 2]")[0] == 400
     assert ask(url, raw=b'{"study": NaN}')[0] == 400
-    assert ask(url, raw=json.dumps(given(study, 0)).encode(), kind="text/plain")[0] == 415
+    assert ask(url, raw=json.dumps(given(study, 0)).encode(), **{"Content-Type": "text/plain"})[0] == 415
     assert ask(url)[0] == 405
     trial_of_another = next(
         trial.id for trial in study.trials if trial.id not in {each.id for each in study.trials_of(0)}

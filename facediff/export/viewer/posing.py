@@ -43,7 +43,8 @@ def pose_fields(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
     closing[lids] = eyes.closing[lids]
 
     def packed(field: npt.NDArray[np.floating]) -> int:
-        return packed_field(field * millimetres(animation), blobs)
+        # One axis after the other: most of a shape is zero, and deflate keeps that short.
+        return blobs.add(np.rint((field * millimetres(animation)).T / FIELD_STEP).astype("<i2").tobytes())
 
     return {
         "step": FIELD_STEP,
@@ -53,12 +54,6 @@ def pose_fields(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:
         "closing": packed(closing),
         "shapes": {name: packed(field) for name, field in shapes.items()},
     }
-
-
-def packed_field(field: npt.NDArray[np.floating], blobs: Blobs) -> int:
-    """Keep displacements (V, 3) in mm in steps of :data:`FIELD_STEP`."""
-    # One axis after the other: most of a shape is zero, and deflate keeps that short.
-    return blobs.add(np.rint(field.T / FIELD_STEP).astype("<i2").tobytes())
 
 
 def acted_curves(animation: Animation, blobs: Blobs) -> dict[str, Any] | None:

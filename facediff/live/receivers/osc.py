@@ -135,11 +135,8 @@ class Osc(_Osc):
     def messages(self, frame: LiveFrame) -> list[bytes]:
         """The messages of a frame, in their order."""
         weights = zip(self._parts, self._weights.of(frame).tolist(), strict=True)
-        about = message("/facediff/frame", frame.index, float(frame.time), float(frame.lag), frame.dropped)
+        about = [message("/facediff/frame", frame.index, float(frame.time), float(frame.lag), frame.dropped)]
         # A model of channels turns the head by weights of its own.
         turned = frame.turned if frame.weights is None or not self._turns else frame.weights[self._turns]
-        return [
-            about,
-            message("/facediff/head", *turned.tolist()),
-            *(part + struct.pack(">f", weight) for part, weight in weights),
-        ]
+        about.append(message("/facediff/head", *turned.tolist()))
+        return [*about, *(part + struct.pack(">f", weight) for part, weight in weights)]

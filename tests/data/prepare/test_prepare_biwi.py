@@ -134,19 +134,6 @@ def test_speech_is_16_khz_of_the_same_length(raw: Path) -> None:
     assert np.abs(samples - expected)[200:-200].max() < 0.005
 
 
-def test_sound_is_taken_out_of_flv(tmp_path: Path) -> None:
-    raw = write_raw_biwi(tmp_path / "raw", subjects=["F2"], sentences=["e01"], frames=25, audio="flv")
-    assert (raw / "videos" / "F2_e01.flv").read_bytes()[:3] == b"FLV"
-    out, report = prepared(raw)
-    assert report.sound
-    samples, rate = soundfile.read(out / "wav" / "F2_e01.wav")
-    assert rate == 16000
-    assert len(samples) == pytest.approx(16000, abs=2400)  # mp3 comes in blocks, with a delay
-    spectrum = np.abs(np.fft.rfft(samples))
-    assert np.argmax(spectrum) * 16000 / len(samples) == pytest.approx(300, abs=4)
-    assert 0.5 < np.abs(samples).max() < 0.7
-
-
 @pytest.mark.parametrize("place", ["wav/F2_e01.wav", "sound/deep/F2_e01_cut.wav", "F2/e01.wav", "audio/F2/e01_cut.wav"])
 def test_sound_is_found_in_all_known_folders_and_preferred_to_the_video(raw: Path, place: str) -> None:
     (raw / place).parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ import flatbuffers
 import numpy as np
 import onnxruntime
 import pytest
+import torch
 
 from facediff.data.track.tflite import OPERATIONS, Converter
 
@@ -63,17 +64,13 @@ def write_model(tensors: list[tuple[tuple[int, ...], np.ndarray | None]], operat
 
 def convolve(image: np.ndarray, kernel: np.ndarray, stride: int, *, depthwise: bool) -> np.ndarray:
     """SAME padding as TensorFlow has it: the odd pixel below and to the right."""
-    height, width, _ = image.shape
-    rows, columns = -(-height // stride), -(-width // stride)
-    size = kernel.shape[1]
-    total = [max((n - 1) * stride + size - m, 0) for n, m in ((rows, height), (columns, width))]
+    size, channels = kernel.shape[1], image.shape[2]
+    total = [max((-(-n // stride) - 1) * stride + size - n, 0) for n in image.shape[:2]]
     padded = np.pad(image, [(t // 2, t - t // 2) for t in total] + [(0, 0)])
-    result = np.zeros((rows, columns, kernel.shape[3] if depthwise else kernel.shape[0]))
-    for i in range(rows):
-        for j in range(columns):
-            part = padded[i * stride : i * stride + size, j * stride : j * stride + size]
-            result[i, j] = (part * kernel[0]).sum((0, 1)) if depthwise else np.einsum("hwc,ohwc->o", part, kernel)
-    return result
+    weights = kernel.transpose(3, 0, 1, 2) if depthwise else kernel.transpose(0, 3, 1, 2)
+    inputs = (torch.from_numpy(np.ascontiguousarray(each)) for each in (padded.transpose(2, 0, 1)[None], weights))
+    result = torch.nn.functional.conv2d(*inputs, stride=stride, groups=channels if depthwise else 1)
+    return result[0].permute(1, 2, 0).numpy()
 
 
 def run(model: bytes, image: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from facediff.mesh import Mesh
 from facediff.utils.server import LOOPBACK, names_of
 from tests.fakes.chromium import Chromium, Page
 from tests.fakes.heads import LONG, lower_face, nearest_vertices, talking, talking_second
-from tests.fakes.serving import servers
+from tests.fakes.serving import ask, servers
 from tests.fakes.small_face import LANDMARKS, build_face, build_rig
 
 FACE, MARKS = build_face(), LANDMARKS
@@ -63,19 +62,6 @@ def serve(picking: Picking) -> Iterator[Serve]:
         yield start
 
 
-def ask(url: str, content: object = None, *, raw: bytes | None = None, **headers: str) -> tuple[int, Any]:
-    """Status and answer; a POST if there is anything to send."""
-    body = raw if raw is not None else None if content is None else json.dumps(content).encode()
-    given = {"Content-Type": "application/json"} if body is not None else {}
-    request = urllib.request.Request(url, body, {**given, **headers})  # noqa: S310 - our own server
-    try:
-        with urllib.request.urlopen(request, timeout=20) as response:  # noqa: S310 - our own server
-            return response.status, response.read()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read()
-
-
 def ask_until_it_ends(url: str) -> None:
     while True:
         ask(url)
@@ -91,8 +77,8 @@ def pairs(**changed: object) -> dict[str, object]:
 
 def test_what_the_page_sends_is_saved_and_ends_the_server(serve: Serve, picking: Picking) -> None:
     address = serve("the page")
-    assert ask(f"{address}/") == (200, b"the page")
-    status, answer = ask(f"{address}/api/landmarks", pairs(), Origin=address)
+    assert ask(f"{address}/")[::2] == (200, b"the page")
+    status, _, answer = ask(f"{address}/api/landmarks", pairs(), Origin=address)
     assert (status, json.loads(answer)) == (200, {"saved": 4, "file": "map.landmarks.json"})
     found = read_landmarks(picking.file)
     assert nearest_vertices(found) == [[MARKS[name], own(name)] for name in list(NAMES)[:4]]
