@@ -29,7 +29,7 @@ class Ear(AudioEncoder):
         raise NotImplementedError
 
 
-class Echo(Inference):
+class Echo(Inference, torch.nn.Module):
     """The motion of a frame is the mean of its standardised speech, and where in the heard speech it lies."""
 
     frame_rate = 25.0
