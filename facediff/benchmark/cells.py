@@ -31,10 +31,9 @@ from facediff.benchmark.plan import (
     find_config,
 )
 from facediff.errors import FaceDiffError, check_known
-from facediff.utils.checksums import describe_files, file_stamps, sha256
+from facediff.utils.checksums import describe_files, file_stamps, hash_of, sha256
 from facediff.utils.files import short_name
 from facediff.utils.hub import check_model_source, model_hash
-from facediff.utils.provenance import hash_of
 from facediff.utils.yaml_files import load_yaml
 
 Kind = Literal["fit", "checkpoint", "predictions"]

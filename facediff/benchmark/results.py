@@ -12,9 +12,10 @@ from typing import Annotated, Any, Self
 
 from facediff.benchmark.cells import Cell
 from facediff.errors import FaceDiffError
+from facediff.utils.checksums import hash_of
 from facediff.utils.limits import check_format, quoted
 from facediff.utils.plain_files import load_json, write_json
-from facediff.utils.provenance import Provenance, hash_of, provenance_of, read_provenance
+from facediff.utils.provenance import Provenance, provenance_of, read_provenance
 from facediff.utils.ranges import Range
 from facediff.utils.records import read_record
 from facediff.version import __version__

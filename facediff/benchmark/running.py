@@ -25,9 +25,9 @@ from facediff.benchmark.results import Result, cell_file, model_result, predicti
 from facediff.errors import FaceDiffError
 from facediff.metrics import device_name
 from facediff.utils.batch import Outcome, run_batch
+from facediff.utils.checksums import hash_of
 from facediff.utils.files import discard
 from facediff.utils.plain_files import load_json, read_json, write_json
-from facediff.utils.provenance import hash_of
 from facediff.utils.workers import THREAD_VARIABLES
 
 RUNS, LOGS = "runs", "logs"

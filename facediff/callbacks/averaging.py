@@ -95,6 +95,7 @@ class EmaWithWarmup(WeightAveraging):
     @torch.no_grad()
     def average(self, averages: Sequence[Tensor], weights: Sequence[Tensor], step: Tensor) -> None:
         """Update the averages of weights of one type on one device."""
-        share = (1 - ((1 + step.float()) / (self.warmup + step.float())).clamp(max=self.decay)).to(averages[0].dtype)
+        step = step.float()
+        share = (1 - ((1 + step) / (self.warmup + step)).clamp(max=self.decay)).to(averages[0].dtype)
         for average, weight in zip(averages, weights, strict=True):
             average.lerp_(weight, share)

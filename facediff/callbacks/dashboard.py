@@ -18,10 +18,10 @@ from torch.optim import Optimizer
 from facediff import registry
 from facediff.data import SpeechMotionDataModule
 from facediff.models import AnimationModel
-from facediff.utils.checksums import sha256
+from facediff.utils.checksums import hash_of, sha256
 from facediff.utils.hints import checks_arguments
 from facediff.utils.hub import model_hash, split_face
-from facediff.utils.provenance import Provenance, hash_of
+from facediff.utils.provenance import Provenance
 from facediff.version import __version__
 
 

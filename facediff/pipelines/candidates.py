@@ -27,7 +27,7 @@ from facediff.mesh.flame import Flame
 from facediff.spaces import Space
 from facediff.spaces.arkit import ARKIT
 from facediff.spaces.files import even, read_parameters
-from facediff.spaces.operations import at_rest
+from facediff.spaces.operations import at_rest, with_apples_mouth
 from facediff.spaces.rigs import decode_flame
 from facediff.spaces.rotations import convert
 from facediff.synthetic.known_faces import is_built_in
@@ -228,6 +228,8 @@ def _read(candidate: Candidate, clips: Sequence[SpokenClip], placement: Placemen
         else:
             layout = candidate.layout if file.suffix in (".npz", ".npy") else None
             recorded = even(read_parameters(file, layout=layout, frame_rate=candidate.frame_rate))
+            if layout == "audio2face":  # tables are read so already
+                recorded = replace(recorded, values=with_apples_mouth(recorded.values, recorded.space.channels))
             motions[clip.name], rate = placement.values(recorded.values, recorded.space), recorded.frame_rate
         if frame_rate is not None and abs(rate - frame_rate) > 1e-6 * rate:
             raise FaceDiffError(

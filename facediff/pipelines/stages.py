@@ -121,20 +121,21 @@ class SampleMotion:
         if self.stretches is None:
             assert self._animation is not None  # noqa: S101 - frames are either of the two
             return self._animation
-        spool, part = Spool(self.folder), None
+        spool, first = Spool(self.folder), None
         small = []  # enough to stay in memory: channels and the head's motion
         for stretch in self.stretches:
             part = stretch.animation
             assert part is not None  # noqa: S101 - decoded
+            first = part if first is None else first  # whose speech is all of it
             spool.write(part.vertices)
             small.append((part.head, part.values, stretch.turns))
-        assert part is not None  # noqa: S101 - a recording has frames
+        assert first is not None  # noqa: S101 - a recording has frames
         head, values, self._turns = (
             None if any(row[column] is None for row in small) else np.concatenate([row[column] for row in small])
             for column in range(3)
         )
-        animation = replace(part, vertices=spool.array(), head=head, channels=None)
-        self.settle(animation if values is None else animation.made_of(part.space, values, part.deltas))
+        animation = replace(first, vertices=spool.array(), head=head, channels=None)
+        self.settle(animation if values is None else animation.made_of(first.space, values, first.deltas))
         return self.animation()
 
     def settle(self, animation: Animation) -> None:

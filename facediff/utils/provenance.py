@@ -6,8 +6,6 @@ chance between training runs, about which the spread over sentences says nothing
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -69,11 +67,6 @@ class Provenance:
     def write_next_to(self, folder: Path) -> None:
         """Write it next to a folder, whole or not at all."""
         write_json(next_to(folder), self.as_dict())
-
-
-def hash_of(content: object) -> str:
-    """SHA-256 of plain data with sorted keys."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def next_to(folder: Path) -> Path:

@@ -409,13 +409,7 @@ def selftalk_state(dataset: str, seed: int = 0, dim: int = 16, reader_layers: in
 
 
 def unmasked_layer(
-    x: Tensor,
-    memory: Tensor | None,
-    s: State,
-    name: str,
-    heads: int,
-    mask: Tensor | float = 0.0,
-    activation: Callable[[Tensor], Tensor] = torch.relu,
+    x: Tensor, memory: Tensor | None, s: State, name: str, heads: int, mask: Tensor | float = 0.0, gelu: bool = False
 ) -> Tensor:
     """torch's post-norm layer; with a memory, of the decoder's form, ``mask`` added to its scores."""
 
@@ -427,7 +421,7 @@ def unmasked_layer(
     x = layer_norm(x + mixed(x, x, "self_attn", 0.0), s, f"{name}.norm1")
     if memory is not None:
         x = layer_norm(x + mixed(x, memory, "multihead_attn", mask), s, f"{name}.norm2")
-    fed = linear(activation(linear(x, s, f"{name}.linear1")), s, f"{name}.linear2")
+    fed = linear((F.gelu if gelu else torch.relu)(linear(x, s, f"{name}.linear1")), s, f"{name}.linear2")
     return layer_norm(x + fed, s, f"{name}.norm{2 if memory is None else 3}")
 
 

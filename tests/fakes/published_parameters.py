@@ -36,7 +36,7 @@ WINDOW, CONTEXT, STEPS, SHAPE, STYLE, DIM = 20, 4, 5, 100, 16, 16
 SCALES, CODE, CODEC, CHANNELS = (1, 2, 5, 10), 8, 16, 106
 
 
-gelu_layer = partial(unmasked_layer, activation=F.gelu)
+gelu_layer = partial(unmasked_layer, gelu=True)
 
 
 def waves(rows: int, dim: int) -> Tensor:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,8 +55,7 @@ def test_motion_of_another_program_is_read_by_the_clips_names(tmp_path: Path) ->
     clips = spoken_set(["en"], 1, 2)
     values = np.random.default_rng(1).uniform(0, 1, (50, 52)).astype(np.float32)
     space = layout("live_link")
-    wide = np.zeros((50, len(space.channels)), np.float32)
-    wide[:, :52] = values
+    wide = np.pad(values, ((0, 0), (0, len(space.channels) - 52)))
     write_parameters(tmp_path / f"{clips[0].name}.csv", ParameterClip(clips[0].name, wide, space, 30.0))
     candidate = Candidate("theirs", motion=tmp_path)
     lacking = perform(candidate, clips, None)
@@ -67,6 +67,13 @@ def test_motion_of_another_program_is_read_by_the_clips_names(tmp_path: Path) ->
     assert made.seconds is None
     own = Placement(open_face()).values(values, Space("arkit", ARKIT))
     assert np.abs(made.clips[clips[0].name].points - own.points).max() < 1e-5
+    # An array in Audio2Face's layout: its mouthClose is the pose of an open jaw with closed lips.
+    np.save(tmp_path / f"{clips[1].name}.npy", values[:, [ARKIT.index(name) for name in layout("audio2face").channels]])
+    made = perform(replace(candidate, layout="audio2face", frame_rate=30.0), clips[1:], None)
+    assert not isinstance(made, str)
+    values[:, ARKIT.index("jawOpen")] += values[:, ARKIT.index("mouthClose")]
+    own = Placement(open_face()).values(values, Space("arkit", ARKIT))
+    assert np.abs(made.clips[clips[1].name].points - own.points).max() < 1e-5
 
 
 class Exported(Animator):

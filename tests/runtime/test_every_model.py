@@ -231,8 +231,6 @@ class Branching(torch.nn.Module):
 
 
 class ByLength(torch.nn.Module):
-    """Does otherwise for long clips."""
-
     def forward(self, motion: torch.Tensor) -> torch.Tensor:
         return motion if motion.shape[1] > 64 else -motion
 

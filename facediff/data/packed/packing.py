@@ -48,12 +48,11 @@ from facediff.errors import FaceDiffError, needs_extra
 from facediff.spaces.space import metres_per_unit
 from facediff.speech.audio import open_sound, refuse_cut_short
 from facediff.utils.batch import begin_folder, do_all
-from facediff.utils.checksums import file_stamps
+from facediff.utils.checksums import file_stamps, hash_of
 from facediff.utils.files import atomic, check_writable, locked
 from facediff.utils.limits import quoted
 from facediff.utils.paths import name_of_file
 from facediff.utils.plain_files import parse_json
-from facediff.utils.provenance import hash_of
 from facediff.utils.ranges import Range, checked
 
 if TYPE_CHECKING:
